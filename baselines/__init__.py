@@ -1,0 +1,1 @@
+"""The methods that compete: one module or folder each, registered in `registry`."""

@@ -1,0 +1,1 @@
+"""Environments, one module or folder a family; import them as `iflow_gym.envs`."""

@@ -1,0 +1,1 @@
+"""The datasets of demonstrations: each comes from its own package or download."""
