@@ -1,0 +1,258 @@
+"""Every metric's name, unit, direction and meaning: the one place where tables read them."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import hashlib
+from dataclasses import dataclass
+from importlib import resources
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number of a result record."""
+
+    name: str
+    """Key in result records, and the name of the function where one computes it."""
+    unit: str
+    """Unit, where "length" is the demonstrations' own, and "-" is none."""
+    better: Literal["lower", "higher"]
+    """Which way is better."""
+    family: Literal["accuracy", "stability", "cost"]
+    """Table that it belongs to."""
+    title: str
+    """Heading in tables."""
+    definition: str
+    """What it is, in a sentence; the docstrings have the equations."""
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric(
+        "rmse",
+        "length",
+        "lower",
+        "accuracy",
+        "RMSE",
+        "Root of the mean squared distance between samples of equal index.",
+    ),
+    Metric(
+        "frechet",
+        "length",
+        "lower",
+        "accuracy",
+        "Fréchet",
+        "Discrete Fréchet distance on the full sequences, Euclidean.",
+    ),
+    Metric(
+        "dtw",
+        "length",
+        "lower",
+        "accuracy",
+        "DTW / sample",
+        "Least sum of Euclidean distances over warping paths with steps (1,0), (0,1) and (1,1), "
+        "without a window, divided by the demonstration's number of samples.",
+    ),
+    Metric(
+        "swept_area",
+        "length²",
+        "lower",
+        "accuracy",
+        "Swept area",
+        "Sum over the steps of the exact, unsigned area of the tetragon between demonstration and "
+        "reproduction; 2-D only.",
+    ),
+    Metric(
+        "swept_surface",
+        "length²",
+        "lower",
+        "accuracy",
+        "Swept surface",
+        "Sum over the steps of the surface of the tetragon between demonstration and reproduction, "
+        "as the smaller of its two pairs of triangles; 3-D only.",
+    ),
+    Metric(
+        "seds_error",
+        "-",
+        "lower",
+        "accuracy",
+        "SEDS error",
+        "Mean over the samples of the weighted errors of direction (0.6) and relative speed (0.4) "
+        "of teacher-forced velocities, as SEDS eq. (23); null for methods that depend on time.",
+    ),
+    Metric(
+        "direction_error",
+        "-",
+        "lower",
+        "accuracy",
+        "Direction error",
+        "Mean over the samples of |1 - cos| of the angle between demonstrated and teacher-forced "
+        "velocity; null for methods that depend on time.",
+    ),
+    Metric(
+        "velocity_rmse",
+        "length/s",
+        "lower",
+        "accuracy",
+        "Velocity RMSE",
+        "Root of the mean squared error of teacher-forced velocities; null for methods that depend "
+        "on time.",
+    ),
+    Metric(
+        "nll_1",
+        "nats",
+        "lower",
+        "accuracy",
+        "NLL, 1 step",
+        "Mean negative log-likelihood of held-out transitions over 1 sample, per dimension; null "
+        "for methods without a density.",
+    ),
+    Metric(
+        "nll_10",
+        "nats",
+        "lower",
+        "accuracy",
+        "NLL, 10 steps",
+        "Mean negative log-likelihood of held-out transitions over 10 samples, per dimension; null "
+        "for methods without a density.",
+    ),
+    Metric(
+        "converged",
+        "-",
+        "higher",
+        "stability",
+        "Converged",
+        "Fraction of the starts that are within 2 % of the diagonal of the goal for the whole last "
+        "5 % of the horizon.",
+    ),
+    Metric(
+        "settling_time",
+        "demonstration durations",
+        "lower",
+        "stability",
+        "Settling time",
+        "Median time to enter the tolerance for good, divided by the mean duration of the "
+        "demonstrations; a start that does not settle takes infinitely long.",
+    ),
+    Metric(
+        "spurious_attractors",
+        "-",
+        "lower",
+        "stability",
+        "Spurious attractors",
+        "Clusters of end states outside the tolerance that have stopped moving.",
+    ),
+    Metric(
+        "diverged",
+        "-",
+        "lower",
+        "stability",
+        "Diverged",
+        "Fraction of the starts that leave the box enlarged 10 times, or are not finite.",
+    ),
+    Metric(
+        "perturbation_recovery",
+        "-",
+        "higher",
+        "stability",
+        "Perturbation recovery",
+        "Fraction of rollouts, pushed once at 40 % of the way by 25 % of the diagonal in a seeded "
+        "random direction, that still converge.",
+    ),
+    Metric(
+        "lyapunov_violation",
+        "-",
+        "lower",
+        "stability",
+        "Lyapunov violation",
+        "Fraction of 10 000 states, drawn uniformly from the enlarged box, where the method's own "
+        "Lyapunov function does not decrease; null for methods that have none.",
+    ),
+    Metric(
+        "fit_seconds",
+        "s",
+        "lower",
+        "cost",
+        "Fit, wall",
+        "Wall time of the fit.",
+    ),
+    Metric(
+        "fit_cpu_seconds",
+        "s",
+        "lower",
+        "cost",
+        "Fit, CPU",
+        "User and system time of the fit, over all threads of the process.",
+    ),
+    Metric(
+        "n_parameters",
+        "-",
+        "lower",
+        "cost",
+        "Parameters",
+        "Number of fitted parameters, as the method counts them.",
+    ),
+    Metric(
+        "step_us",
+        "µs",
+        "lower",
+        "cost",
+        "Step",
+        "Median wall time of a call of the policy with a single state, on one thread.",
+    ),
+    Metric(
+        "peak_memory_mb",
+        "MB",
+        "lower",
+        "cost",
+        "Peak memory",
+        "Peak resident memory of the whole process during the fit, 10^6 bytes.",
+    ),
+)
+"""All metrics of point-to-point motions that are numbers, in the order of their tables. A method's
+guarantee is a word, one of ``stability.GUARANTEES``."""
+
+
+def get_metric(name: str) -> Metric:
+    """Look up a metric by its name.
+
+    Parameters
+    ----------
+    name
+        Key in result records.
+
+    Returns
+    -------
+    Metric
+        The one of that name.
+
+    Raises
+    ------
+    KeyError
+        If there is none; the message suggests the nearest names.
+    """
+    by_name = {metric.name: metric for metric in METRICS}
+    if name not in by_name:
+        near = difflib.get_close_matches(name, by_name) or sorted(by_name)
+        raise KeyError(f"Expected the name of a metric, got {name!r}: did you mean {near}?")
+    return by_name[name]
+
+
+@functools.cache
+def metrics_hash() -> str:
+    """Fingerprint of the code that computes the metrics, for result records.
+
+    Returns
+    -------
+    str
+        SHA-256, in hexadecimal, over the names and the text of this package's source files, sorted
+        by name, with line feeds as line endings. Two records with the same hash mean the same by
+        every number; comments and docstrings, which are the definitions, count too.
+    """
+    digest = hashlib.sha256()
+    files = (f for f in resources.files(__package__).iterdir() if f.name.endswith(".py"))
+    for file in sorted(files, key=lambda f: f.name):
+        text = file.read_bytes().replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+        digest.update(file.name.encode() + b"\0" + text + b"\0")
+    return digest.hexdigest()
