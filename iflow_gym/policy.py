@@ -1,0 +1,168 @@
+"""A DynamicalSystem as a policy, with the interface of Stable-Baselines3's models."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iflow_gym.demonstrations import FloatArray
+from iflow_gym.system import DynamicalSystem
+
+BISECTIONS = 30
+"""Halvings of the time fraction: it is found to 1e-9."""
+
+
+class DynamicalSystemPolicy:
+    """Runs a dynamical system in an environment.
+
+    The command in state x is the mean velocity of the system's own step,
+
+        (step(x, dt) - x) / dt,
+
+    which the environment holds for one dt. So the mass is where the system would be, exactly where
+    the method's flow is exact.
+
+    An environment has a greatest speed. Where a component of the command exceeds it, the command
+    is not clipped: time is slowed along the system's own path. The policy finds by bisection a
+    fraction s in (0, 1] with max_i |step(x, s dt) - x|_i <= max_speed dt, the largest one where
+    the displacement grows with s, and commands (step(x, s dt) - x) / dt. The next state then still
+    lies on the orbit through x, so whatever decreases along orbits still decreases at every step:
+    a Lyapunov function proves as much of the saturated policy as of the system. Clipping, or
+    scaling the command, would leave the orbit.
+
+    In force mode the environment's `command_to_action` turns the command into the force that
+    reaches that velocity at the end of dt; the statement about orbits then holds only as far as the
+    mass follows its command.
+
+    Parameters
+    ----------
+    system : DynamicalSystem
+        Fitted.
+    env : an environment or vector environment of iflow_gym, optional
+        Its `unwrapped.dt` is read at every call, since each episode has its demonstration's.
+    max_speed : float, length/s, and dt : float, seconds
+        In place of `env`: the action is then the command as a fraction of `max_speed`.
+
+    Examples
+    --------
+    >>> policy = DynamicalSystemPolicy(system, env)  # doctest: +SKIP
+    >>> action, _ = policy.predict(observation)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        system: DynamicalSystem,
+        env: Any = None,
+        *,
+        max_speed: float | None = None,
+        dt: float | None = None,
+    ) -> None:
+        n_dims = getattr(system, "n_dims_", None)
+        if n_dims is None:
+            raise ValueError(
+                f"Expected a fitted system, got {type(system).__name__}: call "
+                "fit(demonstrations, seed=0) first."
+            )
+        self.system = system
+        self._n_dims = int(n_dims)
+        self._env: Any = None
+        self._dt = 0.0
+        if env is None:
+            if max_speed is None or dt is None:
+                raise TypeError("Expected an environment, or both max_speed and dt.")
+            if not (max_speed > 0 and dt > 0):
+                raise ValueError(f"Expected max_speed > 0 and dt > 0, got {max_speed} and {dt}.")
+            self.max_speed, self._dt = float(max_speed), float(dt)
+            return
+        if max_speed is not None or dt is not None:
+            raise TypeError("Expected an environment, or max_speed and dt, got both.")
+        self._env = env.unwrapped
+        if not hasattr(self._env, "command_to_action"):
+            raise TypeError(
+                "Expected an environment of iflow_gym, or a batch from gymnasium.make_vec(id, "
+                f"num_envs=n), got {type(self._env).__name__}: it has no command_to_action. Give "
+                "max_speed and dt in its place."
+            )
+        if self._env.n_dims != self._n_dims:
+            raise ValueError(
+                f"Expected a system of {self._env.n_dims} dimensions as the environment has, got "
+                f"{self._n_dims}."
+            )
+        self.max_speed = float(self._env.max_speed)
+
+    @property
+    def dt(self) -> Any:
+        """Seconds a step: the environment's at this moment, a float or shape (n,)."""
+        return self._dt if self._env is None else self._env.dt
+
+    def velocity(self, x: ArrayLike) -> FloatArray:
+        """Return the system's velocity, shape (..., d): what a picture of the policy shows."""
+        return self.system.velocity(x)
+
+    def command(self, x: ArrayLike, dt: float | FloatArray) -> FloatArray:
+        """Return the velocity command, shape (..., d), in positions x, shape (..., d)."""
+        states = np.asarray(x, dtype=np.float64)
+        points = states.reshape(-1, self._n_dims)
+        steps = np.broadcast_to(np.asarray(dt, dtype=np.float64), states.shape[:-1]).reshape(-1)
+        limits = self.max_speed * steps
+        moves = self.system.step(points, steps) - points
+        fast = np.flatnonzero(_largest(moves) > limits)
+        if len(fast):
+            moves[fast] = self._slowed(points[fast], steps[fast], moves[fast], limits[fast])
+        return (moves / steps[:, None]).reshape(states.shape)
+
+    def _slowed(
+        self, x: FloatArray, dt: FloatArray, moves: FloatArray, limits: FloatArray
+    ) -> FloatArray:
+        """Return displacements along the orbits through x that keep the limits, shape (n, d)."""
+        slow, fast = np.zeros(len(x)), np.ones(len(x))
+        best = moves.copy()
+        for _ in range(BISECTIONS):
+            middle = (slow + fast) / 2
+            tried = self.system.step(x, middle * dt) - x
+            within = _largest(tried) <= limits
+            slow, fast = np.where(within, middle, slow), np.where(within, fast, middle)
+            # Of a path that is too fast even at the last trial, the shortest displacement is kept.
+            best[within | (slow == 0)] = tried[within | (slow == 0)]
+        # A safety for that case alone: everything else is within its limit already.
+        return best / np.maximum(_largest(best) / limits, 1.0)[:, None]
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[FloatArray, Any]:
+        """Return actions in [-1, 1], float64, and `state` as it came.
+
+        Parameters
+        ----------
+        observation : array, shape (d,) or (n, d); in force mode 2 d
+            The position comes first.
+        state, episode_start, deterministic
+            Stable-Baselines3's arguments; the policy has no memory and no noise.
+        """
+        values = np.asarray(observation, dtype=np.float64)
+        width = self._n_dims if self._env is None else self._env.observation_space.shape[-1]
+        if values.ndim == 0 or values.shape[-1] != width:
+            raise ValueError(f"Expected observations of shape (..., {width}), got {values.shape}.")
+        dt = self.dt
+        if np.ndim(dt) and np.shape(dt) != values.shape[:-1]:
+            raise ValueError(
+                f"Expected observations of all {len(dt)} environments, got shape {values.shape}: "
+                "each environment has its own dt."
+            )
+        command = self.command(values[..., : self._n_dims], dt)
+        if self._env is None:
+            action = command / self.max_speed
+            return action / np.maximum(_largest(np.abs(action)), 1.0)[..., None], state
+        action = self._env.command_to_action(command, values, dt)
+        return action, state
+
+
+def _largest(vectors: FloatArray) -> FloatArray:
+    """Return the largest component by magnitude, shape (...,)."""
+    return np.asarray(np.abs(vectors).max(axis=-1))

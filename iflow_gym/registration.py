@@ -1,0 +1,35 @@
+"""Environment ids: every environment of the suite, by name.
+
+Any change that may change a score bumps an id's version.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from iflow_gym.datasets.lasa import SHAPES
+
+POINT_MASS_ID = "iflow/PointMass-v0"
+"""The id that takes the caller's own `demonstrations`."""
+
+
+def lasa_id(shape: str) -> str:
+    """Return the id of a LASA shape."""
+    return f"iflow/LASA-{shape}-v0"
+
+
+def register_all() -> None:
+    """Register every id with Gymnasium; ids that are registered already stay as they are."""
+    _register(POINT_MASS_ID, "point_mass:PointMassEnv", "point_mass_vector:PointMassVectorEnv")
+    for shape in SHAPES:
+        _register(lasa_id(shape), "lasa:LASAEnv", "lasa:LASAVectorEnv", shape=shape)
+
+
+def _register(env_id: str, entry_point: str, vector_entry_point: str, **kwargs: object) -> None:
+    if env_id not in gymnasium.registry:
+        gymnasium.register(
+            env_id,
+            entry_point=f"iflow_gym.envs.{entry_point}",
+            vector_entry_point=f"iflow_gym.envs.{vector_entry_point}",
+            kwargs=kwargs,
+        )

@@ -1,0 +1,307 @@
+"""DynamicalSystem: the contract that every method keeps.
+
+A method learns an autonomous system dx/dt = f(x) from demonstrations. It implements `_fit` and
+`_velocity` (and `_step` where it has a closed form), its parameters as arrays for files, and
+states its guarantee. Shapes are checked here, once, so that methods need not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numpy.typing import ArrayLike
+
+from iflow_gym.demonstrations import Demonstrations, FloatArray
+
+SCHEMA_VERSION = 1
+"""Version of the model files that `DynamicalSystem.save` writes."""
+
+GuaranteeKind = Literal["proved", "verified", "sampled", "none"]
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """What is known about stability, and why.
+
+    ``proved``: by construction, for every state. ``verified``: checked on a bounded region with
+    an error bound. ``sampled``: seen to hold where it was tried. ``none``: nothing is claimed.
+    """
+
+    kind: GuaranteeKind
+    reason: str
+
+
+class NotFittedError(RuntimeError):
+    """A system was asked for its field before `fit`."""
+
+
+class DynamicalSystem(ABC):
+    """An autonomous dynamical system dx/dt = f(x) that is learned from demonstrations.
+
+    Attributes
+    ----------
+    n_dims_ : int
+        Dimension d of the state, set by `fit`.
+    goal_ : array, shape (d,)
+        The demonstrations' goal, set by `fit`.
+    """
+
+    name: ClassVar[str]
+    """The method's name in tables and files."""
+    title: ClassVar[str]
+    """The method's name as people write it."""
+    Config: ClassVar[type]
+    """A frozen dataclass of the method's settings."""
+    stochastic_fit: ClassVar[bool] = True
+    """Whether the seed changes the fit."""
+    integrator: ClassVar[str] = "explicit Euler"
+    """How `step` integrates: recorded with every score."""
+
+    def __init__(self, config: Any = None, **settings: Any) -> None:
+        """Store the settings: a `Config`, or its fields by name, or both (names win)."""
+        base: Any = self.Config() if config is None else config
+        if not isinstance(base, self.Config):
+            raise TypeError(
+                f"Expected a {self.Config.__name__} for {type(self).__name__}, got {base!r}."
+            )
+        known = [f.name for f in dataclasses.fields(self.Config)]
+        if unknown := sorted(set(settings) - set(known)):
+            raise TypeError(
+                f"Unknown settings {unknown} for {type(self).__name__}; known: {', '.join(known)}."
+            )
+        self.config: Any = dataclasses.replace(base, **settings)
+
+    # Fitting ------------------------------------------------------------------------------
+
+    def fit(self, demonstrations: Demonstrations, *, seed: int) -> Self:
+        """Learn from demonstrations; the same seed gives the same fit on the same machine."""
+        self._check_demonstrations(demonstrations)
+        self._fit(demonstrations, np.random.default_rng(seed))
+        return self._fitted(demonstrations)
+
+    def fit_many(
+        self, demonstrations: Sequence[Demonstrations], *, seeds: Sequence[int]
+    ) -> list[Self]:
+        """Learn one system for each entry of `demonstrations`, with the seed beside it.
+
+        Methods that train faster together override `_fit_many`; the default is a loop.
+        """
+        if len(demonstrations) != len(seeds):
+            raise ValueError(
+                f"Expected a seed for each of {len(demonstrations)} sets of demonstrations, "
+                f"got {len(seeds)}."
+            )
+        for entry in demonstrations:
+            self._check_demonstrations(entry)
+        systems = self._fit_many(demonstrations, seeds)
+        return [s._fitted(d) for s, d in zip(systems, demonstrations, strict=True)]
+
+    def _fit_many(
+        self, demonstrations: Sequence[Demonstrations], seeds: Sequence[int]
+    ) -> list[Self]:
+        clones = [type(self)(self.config) for _ in seeds]
+        return [c.fit(d, seed=s) for c, d, s in zip(clones, demonstrations, seeds, strict=True)]
+
+    def _check_demonstrations(self, demonstrations: Demonstrations) -> None:
+        if not isinstance(demonstrations, Demonstrations):
+            raise TypeError(
+                f"Expected Demonstrations, got {type(demonstrations).__name__}: make them with "
+                "Demonstrations.from_arrays(...)."
+            )
+        if demonstrations.goal is None:
+            raise ValueError(
+                f"{self.title} learns motions that end at a goal, got {demonstrations.name!r}, "
+                f"which repeats with a period of {demonstrations.period} s."
+            )
+
+    def _fitted(self, demonstrations: Demonstrations) -> Self:
+        self.n_dims_ = demonstrations.n_dims
+        self.goal_ = demonstrations.attractor
+        return self
+
+    @abstractmethod
+    def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
+        """Learn from demonstrations; every random number comes from `rng`."""
+
+    # The field ----------------------------------------------------------------------------
+
+    def velocity(self, x: ArrayLike) -> FloatArray:
+        """Return f(x) in length/s: shape (..., d) for states x of shape (..., d)."""
+        states, shape = self._states(x)
+        return self._velocity(states).reshape(shape)
+
+    def step(self, x: ArrayLike, dt: float | FloatArray) -> FloatArray:
+        """Return the states, shape (..., d), a time dt (seconds, > 0, broadcast) after x."""
+        states, shape = self._states(x)
+        steps = np.broadcast_to(np.asarray(dt, dtype=np.float64), shape[:-1]).reshape(-1)
+        return self._step(states, steps).reshape(shape)
+
+    def rollout(self, x0: ArrayLike, n_steps: int, dt: float) -> FloatArray:
+        """Return the trajectory from x0, shape (..., n_steps + 1, d), x0 (..., d) included."""
+        states, shape = self._states(x0)
+        path = self._rollout(states, int(n_steps), float(dt))
+        return path.reshape(*shape[:-1], n_steps + 1, shape[-1])
+
+    def lyapunov(self, x: ArrayLike) -> FloatArray | None:
+        """Return V(x), shape (...), for a method that has a Lyapunov function; None otherwise."""
+        states, shape = self._states(x)
+        value = self._lyapunov(states)
+        return None if value is None else value.reshape(shape[:-1])
+
+    def lyapunov_rate(self, x: ArrayLike) -> FloatArray | None:
+        """Return dV/dt along the field, shape (...); None without a Lyapunov function."""
+        states, shape = self._states(x)
+        value = self._lyapunov_rate(states)
+        return None if value is None else value.reshape(shape[:-1])
+
+    def log_prob(self, x: ArrayLike, x_next: ArrayLike, dt: float) -> FloatArray | None:
+        """Return log p(x_next | x, dt), shape (...); None for a method without a density."""
+        states, shape = self._states(x)
+        following, _ = self._states(x_next)
+        value = self._log_prob(states, following, float(dt))
+        return None if value is None else value.reshape(shape[:-1])
+
+    @abstractmethod
+    def _velocity(self, x: FloatArray) -> FloatArray:
+        """Return f(x), shape (n, d)."""
+
+    def _step(self, x: FloatArray, dt: FloatArray) -> FloatArray:
+        return x + dt[:, None] * self._velocity(x)
+
+    def _rollout(self, x0: FloatArray, n_steps: int, dt: float) -> FloatArray:
+        path = np.empty((len(x0), n_steps + 1, x0.shape[1]))
+        path[:, 0] = x0
+        steps = np.full(len(x0), dt)
+        for k in range(n_steps):
+            path[:, k + 1] = self._step(path[:, k], steps)
+        return path
+
+    def _lyapunov(self, x: FloatArray) -> FloatArray | None:
+        return None
+
+    def _lyapunov_rate(self, x: FloatArray) -> FloatArray | None:
+        return None
+
+    def _log_prob(self, x: FloatArray, x_next: FloatArray, dt: float) -> FloatArray | None:
+        return None
+
+    @property
+    @abstractmethod
+    def guarantee(self) -> Guarantee:
+        """What is known about the stability of the fitted field, and why."""
+
+    @property
+    def n_parameters(self) -> int:
+        """How many numbers describe the fitted system."""
+        self._require_fit()
+        return sum(a.size for a in self._arrays().values())
+
+    def _require_fit(self) -> None:
+        if not hasattr(self, "n_dims_"):
+            raise NotFittedError(
+                f"{type(self).__name__} has not been fitted: call fit(demonstrations, seed=0)."
+            )
+
+    def _states(self, x: ArrayLike) -> tuple[FloatArray, tuple[int, ...]]:
+        self._require_fit()
+        states = np.asarray(x, dtype=np.float64)
+        if states.ndim == 0 or states.shape[-1] != self.n_dims_:
+            raise ValueError(f"Expected states of shape (..., {self.n_dims_}), got {states.shape}.")
+        return states.reshape(-1, self.n_dims_), states.shape
+
+    # Files --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Return the fitted parameters by name."""
+
+    @abstractmethod
+    def _restore(self, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take the fitted parameters back; raise KeyError or ValueError if they do not fit."""
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write a safetensors file whose header holds the settings as JSON; replace atomically."""
+        self._require_fit()
+        header = {
+            "schema_version": SCHEMA_VERSION,
+            "method": self.name,
+            "config": dataclasses.asdict(self.config),
+            "n_dims": self.n_dims_,
+        }
+        arrays = {k: np.ascontiguousarray(a) for k, a in self._arrays().items()}
+        arrays["goal"] = np.array(self.goal_)
+        target = Path(path)
+        partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
+        partial.write_bytes(
+            safetensors.numpy.save(arrays, metadata={"iflow_gym": json.dumps(header)})
+        )
+        partial.replace(target)
+        return target
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file that `save` wrote; raise ModelFileError if it is anything else."""
+        header, arrays = read_model_file(path)
+        if header["method"] != cls.name:
+            raise ModelFileError(
+                f"Expected {path} to hold a {cls.name!r} model, got {header['method']!r}."
+            )
+        try:
+            system = cls(cls.Config(**_as_tuples(header["config"])))
+            system.n_dims_ = int(header["n_dims"])
+            goal = arrays.pop("goal")
+            if goal.shape != (system.n_dims_,):
+                raise ValueError(f"goal of shape {goal.shape} for n_dims {system.n_dims_}")
+            system.goal_ = goal
+            system._restore(arrays)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise ModelFileError(f"{path} is no whole {cls.name!r} model: {error}.") from error
+        return system
+
+
+class ModelFileError(ValueError):
+    """A model file is not what it should be."""
+
+
+def read_model_file(
+    path: str | os.PathLike[str],
+) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
+    """Return the header and the arrays of a model file; nothing in it is executed."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {})["iflow_gym"])
+            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no dict)
+        version = int(header["schema_version"])
+        expected = {"method", "config", "n_dims"}
+        if missing := expected - set(header):
+            raise KeyError(f"header without {sorted(missing)}")
+    except FileNotFoundError:
+        raise
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(
+            f"Expected {path} to be a model file of iflow-gym, got something else: {error}."
+        ) from error
+    if version > SCHEMA_VERSION:
+        raise ModelFileError(
+            f"{path} has schema version {version}, this package reads up to {SCHEMA_VERSION}: "
+            "upgrade iflow-gym."
+        )
+    for key, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ModelFileError(f"Expected finite parameters in {path}, got NaN in {key!r}.")
+    return header, arrays
+
+
+def _as_tuples(config: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON has lists where settings have tuples."""
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}

@@ -1,0 +1,452 @@
+"""What every method keeps, whichever it is: the registry's methods, one after another.
+
+Each is fitted on thinned LASA shapes with settings that make it quick, so that nothing here says
+how good a method is; it says that a method is what `DynamicalSystem` promises.
+"""
+
+import dataclasses
+import functools
+import json
+
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+
+from iflow_gym.baselines.registry import METHODS, load_method
+from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.system import (
+    SCHEMA_VERSION,
+    DynamicalSystem,
+    ModelFileError,
+    NotFittedError,
+    read_model_file,
+)
+
+QUICK = {"imitation-flow": {"n_steps": 60}}
+"""Settings of methods that would take long; an accurate fit is not what is asked here."""
+
+every_method = pytest.mark.parametrize("name", METHODS)
+every_cell = pytest.mark.parametrize("shape", ["Angle", "Sshape"])
+
+
+def make(name):
+    return load_method(name)(**QUICK.get(name, {}))
+
+
+def thinned(shape, every=10, shift=(0.0, 0.0), n=3):
+    full = load_lasa(shape).subset(range(n))
+    # The last sample stays, since it is the goal.
+    return Demonstrations.from_arrays(
+        [p[::-1][::every][::-1] + shift for p in full.positions],
+        velocities=[v[::-1][::every][::-1] for v in full.velocities],
+        dt=[h * every for h in full.dt],
+        goal=full.goal + shift,
+        name=full.name,
+    )
+
+
+def in_space():
+    """Three recordings in 3-D: Angle, and a smooth third coordinate that also ends at 0."""
+    flat = thinned("Angle")
+    rise = [np.linspace(1, 0, len(p)) ** 2 * 20 for p in flat.positions]
+    return Demonstrations.from_arrays(
+        [np.column_stack([p, z]) for p, z in zip(flat.positions, rise, strict=True)],
+        dt=flat.dt,
+        goal=np.zeros(3),
+    )
+
+
+@functools.cache
+def fitted(name, shape="Angle"):
+    return make(name).fit(thinned(shape), seed=0)
+
+
+def states(shape="Angle", n=40, factor=1.0, seed=0):
+    """States drawn uniformly from the demonstrations' box, enlarged by half of each side."""
+    box = thinned(shape).bounding_box
+    centre, half = (box.low + box.high) / 2, (box.high - box.low)
+    return centre + factor * half * np.random.default_rng(seed).uniform(-1, 1, size=(n, 2))
+
+
+# Fitting ------------------------------------------------------------------------------------
+
+
+@every_method
+def test_is_declared(name):
+    cls = load_method(name)
+    assert issubclass(cls, DynamicalSystem)
+    assert cls.name == name
+    assert cls.title
+    assert cls.integrator
+    config = cls.Config()
+    assert dataclasses.is_dataclass(config)
+    first = dataclasses.fields(config)[0].name
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(config, first, None)
+    with pytest.raises(TypeError, match="Unknown settings"):
+        cls(no_such_setting=1)
+
+
+@every_method
+@every_cell
+def test_fit_returns_self_and_sets_what_it_promises(name, shape):
+    system = make(name)
+    assert system.fit(thinned(shape), seed=0) is system
+    assert system.n_dims_ == 2
+    np.testing.assert_array_equal(system.goal_, [0.0, 0.0])
+    assert system.n_parameters > 0
+
+
+@every_method
+def test_the_same_seed_gives_the_same_fit(name):
+    again = make(name).fit(thinned("Angle"), seed=0)
+    np.testing.assert_array_equal(again.velocity(states()), fitted(name).velocity(states()))
+
+
+@every_method
+def test_the_seed_matters_only_where_the_method_says_so(name):
+    if load_method(name).stochastic_fit:
+        pytest.skip("stochastic")
+    other = make(name).fit(thinned("Angle"), seed=1)
+    np.testing.assert_array_equal(other.velocity(states()), fitted(name).velocity(states()))
+
+
+@every_method
+def test_fitting_draws_no_global_random_numbers(name):
+    np.random.seed(7)  # noqa: NPY002 (the global state is what is looked at)
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    make(name).fit(thinned("Angle"), seed=0)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+
+
+@every_method
+def test_fit_many_keeps_the_order(name):
+    shifts = [(0.0, 0.0), (50.0, -20.0)]
+    sets = [thinned("Angle", shift=s) for s in shifts]
+    systems = make(name).fit_many(sets, seeds=[0, 1])
+    for system, shift in zip(systems, shifts, strict=True):
+        np.testing.assert_array_equal(system.goal_, shift)
+        assert np.isfinite(system.velocity(states() + shift)).all()
+    with pytest.raises(ValueError, match="a seed for each"):
+        make(name).fit_many(sets, seeds=[0])
+
+
+@every_method
+def test_a_shifted_motion_gives_the_shifted_field(name):
+    """To 1 % of the peak speed: training in single precision rounds the shifted data otherwise."""
+    shift = np.array([64.0, -32.0])
+    moved = make(name).fit(thinned("Angle", shift=shift), seed=0)
+    x = np.concatenate(thinned("Angle").positions)
+    np.testing.assert_allclose(
+        moved.velocity(x + shift),
+        fitted(name).velocity(x),
+        rtol=0,
+        atol=0.01 * thinned("Angle").peak_speed,
+    )
+
+
+@every_method
+def test_learns_in_three_dimensions(name):
+    demonstrations = in_space()
+    system = make(name).fit(demonstrations, seed=0)
+    path = system.rollout(demonstrations.starts, 5, demonstrations.mean_dt)
+    assert path.shape == (3, 6, 3)
+    assert np.isfinite(path).all()
+
+
+@every_method
+def test_other_data_are_refused(name):
+    with pytest.raises(TypeError, match="Expected Demonstrations, got ndarray"):
+        make(name).fit(np.zeros((10, 2)), seed=0)
+
+
+@every_method
+def test_an_unfitted_system_says_so(name, tmp_path):
+    system = make(name)
+    for call in (
+        lambda: system.velocity([0.0, 0.0]),
+        lambda: system.step([0.0, 0.0], 0.1),
+        lambda: system.rollout([0.0, 0.0], 3, 0.1),
+        lambda: system.n_parameters,
+        lambda: system.save(tmp_path / "model"),
+    ):
+        with pytest.raises(NotFittedError, match="call fit"):
+            call()
+
+
+# The field ----------------------------------------------------------------------------------
+
+
+@every_method
+def test_shapes_agree(name):
+    system = fitted(name)
+    x = states(n=12)
+    dt = thinned("Angle").mean_dt
+    calls = {
+        "velocity": system.velocity,
+        "step": lambda s: system.step(s, dt),
+        "rollout": lambda s: system.rollout(s, 3, dt),
+        "lyapunov": system.lyapunov,
+        "lyapunov_rate": system.lyapunov_rate,
+        "log_prob": lambda s: system.log_prob(s, s + 1.0, dt),
+    }
+    for label, call in calls.items():
+        batch = call(x)
+        if batch is None:
+            continue
+        folded, one = call(x.reshape(3, 4, 2)), call(x[0])
+        assert folded.shape == (3, 4, *batch.shape[1:]), label
+        assert one.shape == batch.shape[1:], label
+        # A product of another batch size may round otherwise.
+        scale = np.abs(batch).max()
+        np.testing.assert_allclose(folded.reshape(batch.shape), batch, rtol=0, atol=1e-9 * scale)
+        np.testing.assert_allclose(one, batch[0], rtol=0, atol=1e-6 * scale, err_msg=label)
+
+
+@every_method
+def test_an_empty_batch_stays_empty(name):
+    assert fitted(name).velocity(np.empty((0, 2))).shape == (0, 2)
+    assert fitted(name).step(np.empty((0, 2)), 0.1).shape == (0, 2)
+
+
+@every_method
+def test_wrong_dimensions_are_refused(name):
+    for bad in (np.zeros(3), np.zeros((4, 1)), 0.0):
+        with pytest.raises(ValueError, match=r"Expected states of shape \(..., 2\)"):
+            fitted(name).velocity(bad)
+
+
+@every_method
+def test_the_field_is_float64_and_leaves_its_input_alone(name):
+    x = states()
+    kept = x.copy()
+    assert fitted(name).velocity(x).dtype == np.float64
+    fitted(name).step(x, 0.1)
+    fitted(name).rollout(x, 2, 0.1)
+    np.testing.assert_array_equal(x, kept)
+
+
+@every_method
+@pytest.mark.parametrize("factor", [10.0, 1e3])
+def test_the_field_is_finite_far_away(name, factor):
+    assert np.isfinite(fitted(name).velocity(states(factor=factor))).all()
+
+
+@every_method
+@every_cell
+def test_a_small_step_goes_along_the_field(name, shape):
+    system = fitted(name, shape)
+    demonstrations = thinned(shape)
+    x = np.concatenate(demonstrations.positions)[::7]
+    dt = 1e-5 * demonstrations.durations.mean()
+    np.testing.assert_allclose(
+        (system.step(x, dt) - x) / dt,
+        system.velocity(x),
+        rtol=1e-2,
+        atol=1e-2 * demonstrations.peak_speed,
+    )
+
+
+@every_method
+def test_each_state_has_its_own_time_step(name):
+    """A batch with one dt a state gives what each state gives alone."""
+    x, dt = states(n=5), np.array([0.01, 0.02, 0.05, 0.1, 0.2])
+    alone = [fitted(name).step(s, h) for s, h in zip(x, dt, strict=True)]
+    np.testing.assert_allclose(fitted(name).step(x, dt), alone, rtol=1e-5, atol=1e-5)
+
+
+@every_method
+def test_a_rollout_is_repeated_steps_from_its_start(name):
+    system = fitted(name)
+    demonstrations = thinned("Angle")
+    x0, dt = demonstrations.starts, demonstrations.mean_dt
+    path = system.rollout(x0, 20, dt)
+    assert path.shape == (3, 21, 2)
+    np.testing.assert_allclose(path[:, 0], x0, rtol=0, atol=1e-9)
+    x = x0
+    for k in range(20):
+        x = system.step(x, dt)
+        # A closed form jumps from the start, a loop of steps adds their rounding.
+        np.testing.assert_allclose(
+            path[:, k + 1], x, rtol=0, atol=1e-3 * demonstrations.bounding_box.diagonal
+        )
+
+
+# Stability ----------------------------------------------------------------------------------
+
+
+@every_method
+@every_cell
+def test_the_guarantee_is_stated(name, shape):
+    guarantee = fitted(name, shape).guarantee
+    assert guarantee.kind in ("proved", "verified", "sampled", "none")
+    assert len(guarantee.reason) > 20
+
+
+@every_method
+@every_cell
+def test_the_goal_is_an_equilibrium_of_what_promises_one(name, shape):
+    system = fitted(name, shape)
+    if system.guarantee.kind == "none":
+        pytest.skip("promises nothing")
+    demonstrations = thinned(shape)
+    speed = np.linalg.norm(system.velocity(system.goal_))
+    assert speed <= 1e-5 * demonstrations.peak_speed
+    moved = np.linalg.norm(system.step(system.goal_, 1.0) - system.goal_)
+    assert moved <= 1e-5 * demonstrations.bounding_box.diagonal
+
+
+@every_method
+@every_cell
+def test_a_lyapunov_function_is_positive_and_decreases(name, shape):
+    system = fitted(name, shape)
+    x = states(shape, n=2000)
+    value, rate = system.lyapunov(x), system.lyapunov_rate(x)
+    assert (value is None) == (rate is None)
+    if value is None:
+        pytest.skip("has none")
+    assert (value > 0).all()
+    at_goal = system.lyapunov(system.goal_)
+    assert 0 <= at_goal <= 1e-6 * value.max()
+    if system.guarantee.kind == "proved":
+        assert (rate < 0).all()
+
+
+@every_method
+def test_the_lyapunov_rate_is_the_derivative_along_the_field(name):
+    system = fitted(name)
+    x = np.concatenate(thinned("Angle").positions)[:-30:7]
+    rate = system.lyapunov_rate(x)
+    if rate is None:
+        pytest.skip("has none")
+    h = 1e-3 * thinned("Angle").durations.mean()
+    v = system.velocity(x)
+    numeric = (system.lyapunov(x + h * v / 2) - system.lyapunov(x - h * v / 2)) / h
+    np.testing.assert_allclose(rate, numeric, rtol=0.05, atol=0.02 * np.abs(rate).max())
+
+
+# Density ------------------------------------------------------------------------------------
+
+
+@every_method
+@pytest.mark.parametrize("k", [1, 10])
+def test_a_density_integrates_to_one(name, k):
+    """By the midpoint rule on a grid that is laid by the density's own moments; within 2 %."""
+    system = fitted(name)
+    demonstrations = thinned("Angle")
+    x, dt = demonstrations.positions[0], k * demonstrations.dt[0]
+    if system.log_prob(x[0], x[k], dt) is None:
+        pytest.skip("has none")
+    start = x[40]
+    residuals = x[k:] - system.step(x[:-k], dt)
+    mean, root = system.step(start, dt), np.diag(residuals.std(axis=0))
+    edges = np.linspace(-9, 9, 301)
+    nodes = (edges[1:] + edges[:-1]) / 2
+    cells = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
+    for _ in range(4):  # the last pass integrates, those before find where
+        grid = mean + cells @ root.T
+        mass = np.exp(system.log_prob(np.broadcast_to(start, grid.shape), grid, dt))
+        mass *= np.linalg.det(root) * (nodes[1] - nodes[0]) ** 2
+        total = mass.sum()
+        share = mass / total
+        mean = share @ grid
+        root = np.linalg.cholesky((grid - mean).T @ ((grid - mean) * share[:, None]))
+    assert total == pytest.approx(1.0, abs=0.02)
+
+
+# Files --------------------------------------------------------------------------------------
+
+
+@every_method
+@every_cell
+def test_a_saved_system_comes_back_bit_for_bit(name, shape, tmp_path):
+    system = fitted(name, shape)
+    path = system.save(tmp_path / "model.safetensors")
+    again = load_method(name).load(path)
+    x = states(shape)
+    dt = thinned(shape).mean_dt
+    np.testing.assert_array_equal(again.velocity(x), system.velocity(x))
+    np.testing.assert_array_equal(again.step(x, dt), system.step(x, dt))
+    assert again.config == system.config
+    assert again.guarantee == system.guarantee
+    assert again.n_parameters == system.n_parameters
+    for pair in zip(
+        (again.lyapunov(x), again.log_prob(x, x, dt)),
+        (system.lyapunov(x), system.log_prob(x, x, dt)),
+        strict=True,
+    ):
+        assert (pair[0] is None) == (pair[1] is None)
+        if pair[0] is not None:
+            np.testing.assert_array_equal(*pair)
+
+
+@pytest.fixture
+def model(request, tmp_path):
+    return fitted(request.getfixturevalue("name")).save(tmp_path / "model.safetensors")
+
+
+@every_method
+def test_a_truncated_file_is_refused(name, model):
+    whole = model.read_bytes()
+    for cut in (0, 5, len(whole) // 2, len(whole) - 1):
+        model.write_bytes(whole[:cut])
+        with pytest.raises(ModelFileError):
+            load_method(name).load(model)
+
+
+@every_method
+def test_a_foreign_file_is_refused(name, tmp_path):
+    path = tmp_path / "model.safetensors"
+    path.write_text("not a model", encoding="utf-8")
+    with pytest.raises(ModelFileError, match="something else"):
+        load_method(name).load(path)
+    safetensors.numpy.save_file({"a": np.zeros(3)}, path)
+    with pytest.raises(ModelFileError, match="something else"):
+        load_method(name).load(path)
+    with pytest.raises(FileNotFoundError):
+        load_method(name).load(tmp_path / "absent")
+
+
+def rewritten(path, arrays=None, **changes):
+    """Change a model file's header, or its arrays."""
+    header, old = read_model_file(path)
+    safetensors.numpy.save_file(
+        old if arrays is None else arrays(old),
+        path,
+        metadata={"iflow_gym": json.dumps({**header, **changes})},
+    )
+
+
+@every_method
+def test_files_of_another_version_method_or_setting_are_refused(name, model):
+    kept = model.read_bytes()
+    for changes, message in (
+        ({"schema_version": SCHEMA_VERSION + 1}, "upgrade iflow-gym"),
+        ({"method": "another"}, "got 'another'"),
+        ({"config": {"no_such_setting": 1}}, "no whole"),
+        ({"n_dims": 3}, "no whole"),
+    ):
+        model.write_bytes(kept)
+        rewritten(model, **changes)
+        with pytest.raises(ModelFileError, match=message):
+            load_method(name).load(model)
+
+
+@every_method
+def test_files_with_other_arrays_are_refused(name, model):
+    kept = model.read_bytes()
+    names = sorted(set(read_model_file(model)[1]) - {"goal"})
+
+    def without(arrays):
+        return {k: v for k, v in arrays.items() if k != names[0]}
+
+    def with_nan(arrays):
+        return {**arrays, "goal": np.array([np.nan, 0.0])}
+
+    for change in (without, with_nan):
+        model.write_bytes(kept)
+        rewritten(model, arrays=change)
+        with pytest.raises(ModelFileError):
+            load_method(name).load(model)
