@@ -1,0 +1,275 @@
+"""The plan of a run: names, presets, keys and jobs; nothing here starts a process."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import re
+import subprocess
+import sys
+import tomllib
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from iflow_gym.baselines import registry
+from iflow_gym.baselines.registry import METHODS, UnknownNameError, load_method
+from iflow_gym.baselines.runner import plan, presets
+from iflow_gym.baselines.runner.fingerprint import method_code
+from iflow_gym.baselines.runner.presets import PRESETS, PresetError, load_preset
+
+ROOT = Path(__file__).parents[1]
+
+TOY = '''
+"""A toy."""
+from dataclasses import dataclass
+import numpy as np
+from iflow_gym.system import DynamicalSystem, Guarantee
+{imports}
+
+@dataclass(frozen=True)
+class Config:
+    rate: float = 2.0
+
+
+class Toy(DynamicalSystem):
+    """Goes straight home."""
+
+    name = "{name}"
+    title = "Toy"
+    Config = Config
+    stochastic_fit = {stochastic}
+
+    def _fit(self, demonstrations, rng):
+        self.rate_ = np.array([self.config.rate])  # per second
+
+    def _velocity(self, x):
+        return -self.rate_ * (x - self.goal_)
+
+    @property
+    def guarantee(self):
+        return Guarantee("proved", "linear")
+
+    def _arrays(self):
+        return {{"rate": self.rate_}}
+
+    def _restore(self, arrays):
+        self.rate_ = arrays["rate"]
+'''
+
+
+@pytest.fixture
+def make_toy(tmp_path, monkeypatch):
+    """Write a module with a toy method, and return its `module:Class`."""
+    monkeypatch.syspath_prepend(tmp_path)
+    names = []
+
+    def make(module, name=None, stochastic=False, imports="", text=TOY):
+        source = text.format(name=name or module, stochastic=stochastic, imports=imports)
+        (tmp_path / f"{module}.py").write_text(source)
+        importlib.invalidate_caches()
+        names.append(module)
+        return f"{module}:Toy"
+
+    yield make
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def keys(target, preset="smoke", **changes):
+    """Environment, protocol and seed of each cell to its key."""
+    settings = presets.load_preset(preset)
+    settings = dataclasses.replace(settings, **changes) if changes else settings
+    environments = plan.select_environments(settings.environments)
+    cells = plan.make_cells(plan.select_entries([target], preset), environments, settings)
+    return {(c.environment, c.protocol, c.seed): c.key for c in cells}
+
+
+# Names ------------------------------------------------------------------------------------
+
+
+def test_names_that_are_none_are_answered_with_the_nearest():
+    with pytest.raises(UnknownNameError, match="Did you mean linear"):
+        load_method("liner")
+    with pytest.raises(UnknownNameError, match="Did you mean replay"):
+        plan.select_entries(["replai"], "smoke")
+    with pytest.raises(UnknownNameError, match="Did you mean LASA-Angle-v0"):
+        plan.select_environments(["LASA-Angel-v0"])
+    with pytest.raises(UnknownNameError, match="LASA-Angle-v0"):
+        plan.select_environments(["Angle"])
+
+
+def test_a_module_without_the_class_and_a_class_that_is_no_method_are_refused():
+    with pytest.raises(UnknownNameError, match="put its folder on PYTHONPATH"):
+        load_method("no_such_package:Method")
+    with pytest.raises(UnknownNameError, match=r"Did you mean iflow_gym\.system:DynamicalSystem"):
+        load_method("iflow_gym.system:DynamicalSystme")
+    with pytest.raises(UnknownNameError, match="abstract"):
+        load_method("iflow_gym.system:DynamicalSystem")
+    with pytest.raises(UnknownNameError, match="subclass"):
+        load_method("iflow_gym.system:Guarantee")
+
+
+def test_environments_are_chosen_by_globs_over_ids_and_short_names():
+    assert len(plan.select_environments(["LASA-*"])) == 30
+    assert plan.select_environments(["iflow/LASA-Angle-v0", "LASA-Ang*"]) == ["iflow/LASA-Angle-v0"]
+    families = Counter(plan.family(e) for e in plan.select_environments(["LASA-*"]))
+    assert families == {"LASA-26": 26, "LASA-Multi": 4}
+
+
+def test_a_class_that_takes_anothers_name_is_refused(make_toy):
+    thief = make_toy("thief", name="linear")
+    with pytest.raises(UnknownNameError, match=r"different names.*another `name`"):
+        plan.select_entries([thief], "smoke")
+
+
+# Presets ----------------------------------------------------------------------------------
+
+
+def test_presets_say_what_the_documentation_says():
+    smoke, standard, full = (load_preset(name) for name in PRESETS)
+    assert smoke.environments == ("LASA-Angle-v0", "LASA-Sshape-v0", "LASA-Sharpc-v0")
+    assert smoke.protocols == ("reproduction",)
+    assert len(plan.select_environments(standard.environments)) == 30
+    assert (len(standard.seeds), len(full.seeds)) == (1, 3)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_is_one_file_one_line_and_one_preset(name):
+    """Beside its own files a method appears once, in the registry, and has one preset file."""
+    module = METHODS[name].partition(":")[0]
+    own = ROOT / Path(*module.split(".")[1:])
+    assert own.with_suffix(".py").is_file() != (own / "__init__.py").is_file()
+    others = [ROOT / "baselines" / f for f in ("registry.py", "references.py", "run_all.py")]
+    others += [*(ROOT / "baselines" / "runner").glob("*.py"), *(ROOT / "envs").glob("*.py")]
+    mentions = [
+        (path.name, line)
+        for path in others
+        for line in path.read_text().splitlines()
+        if re.search(rf"{re.escape(module)}\b", line)
+    ]
+    assert [path for path, _ in mentions] == ["registry.py"]
+    assert set(tomllib.loads((presets.PRESETS_FOLDER / f"{name}.toml").read_text())) == set(PRESETS)
+    for preset in PRESETS:
+        (entry,) = plan.select_entries([name], preset)
+        assert entry.name == name
+
+
+def test_no_preset_is_left_over():
+    files = {p.stem for p in presets.PRESETS_FOLDER.glob("*.toml")}
+    assert files == {*METHODS, "run"}
+
+
+def test_a_new_method_runs_after_its_file_its_line_and_its_preset(make_toy, monkeypatch, tmp_path):
+    target = make_toy("newcomer")
+    monkeypatch.setitem(registry.METHODS, "newcomer", target)
+    folder = tmp_path / "presets"
+    folder.mkdir()
+    monkeypatch.setattr(presets, "PRESETS_FOLDER", folder)
+    with pytest.raises(PresetError, match=r"newcomer\.toml.*\[smoke\], \[standard\], \[full\]"):
+        plan.select_entries(["newcom*"], "smoke")
+    (folder / "newcomer.toml").write_text("[smoke]\nrate = 3.0\n[standard]\n[full]\n")
+    (entry,) = plan.select_entries(["newcom*"], "smoke")
+    assert entry.config == {"rate": 3.0}
+    (folder / "newcomer.toml").write_text("[smoke]\nrat = 3.0\n")
+    with pytest.raises(PresetError, match=r"newcomer in preset \[smoke\].*rat.*known: rate"):
+        plan.select_entries(["newcom*"], "smoke")
+    with pytest.raises(PresetError, match=r"section \[full\]"):
+        plan.select_entries(["newcom*"], "full")
+
+
+# Keys -------------------------------------------------------------------------------------
+
+
+def test_every_cell_has_a_key_of_its_own_that_stays(make_toy):
+    target = make_toy("toy_keys", stochastic=True)
+    first = keys(target, "full", environments=("LASA-A*", "LASA-B*"))
+    assert len(first) == len(set(first.values())) == 2 * 2 * 3
+    assert first == keys(target, "full", environments=("LASA-A*", "LASA-B*"))
+
+
+def test_a_method_without_randomness_runs_with_one_seed(make_toy):
+    assert {seed for _, _, seed in keys(make_toy("toy_fixed"), "full")} == {0}
+
+
+def test_code_settings_and_libraries_change_a_key_and_comments_do_not(make_toy, monkeypatch):
+    target = make_toy("toy_code")
+    before = keys(target)
+    make_toy("toy_code", text=TOY.replace("  # per second", "").replace("Goes straight", "Goes"))
+    assert keys(target) == before
+    make_toy("toy_code", text=TOY.replace("-self.rate_", "-2 * self.rate_"))
+    changed = keys(target)
+    assert not set(changed.values()) & set(before.values())
+    monkeypatch.setattr(plan, "versions", lambda libraries=(): {"numpy": "0.0"})
+    assert not set(keys(target).values()) & set(changed.values())
+
+
+def test_code_that_a_method_imports_from_beside_it_counts(make_toy, tmp_path):
+    package = tmp_path / "toy_package"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "helper.py").write_text("FACTOR = 1.0\n")
+    (package / "other.py").write_text("UNUSED = 1.0\n")
+    source = TOY.format(name="toy", stochastic=False, imports="from . import helper")
+    (package / "method.py").write_text(source)
+    before = method_code("toy_package.method")
+    assert before.libraries == ("numpy",)
+    (package / "other.py").write_text("UNUSED = 2.0\n")
+    assert method_code("toy_package.method") == before
+    (package / "helper.py").write_text("FACTOR = 2.0\n")
+    assert method_code("toy_package.method") != before
+
+
+def test_the_core_and_the_metrics_change_every_key(make_toy, monkeypatch):
+    target = make_toy("toy_core")
+    before = keys(target)
+    for name in ("core_hash", "metrics_hash"):
+        with monkeypatch.context() as context:
+            context.setattr(plan, name, lambda: "another")
+            assert not set(keys(target).values()) & set(before.values())
+    assert keys(target) == before
+
+
+# Jobs -------------------------------------------------------------------------------------
+
+
+def jobs_of(make_toy, n_workers, batched, n_environments, preset="standard"):
+    (entry,) = plan.select_entries([make_toy(f"toy_{batched}_{n_environments}".lower())], preset)
+    entry = dataclasses.replace(entry, batched=batched)
+    environments = plan.select_environments(["LASA-*"])[:n_environments]
+    cells = plan.make_cells([entry], environments, load_preset(preset))
+    jobs = plan.make_jobs(cells, n_workers)
+    assert sorted(c.key for job in jobs for c in job) == sorted(c.key for c in cells)
+    return jobs
+
+
+def test_cells_that_are_fitted_together_are_split_among_the_workers(make_toy):
+    assert [len(j) for j in jobs_of(make_toy, 2, True, 30)] == [15, 15, 15, 15]
+    for job in jobs_of(make_toy, 2, True, 30):
+        assert len({c.protocol for c in job}) == 1
+    small = [4] * 6 + [3] * 2
+    assert [len(j) for j in jobs_of(make_toy, 64, True, 30)] == [*small, *small]
+    assert [len(j) for j in jobs_of(make_toy, 2, True, 3)] == [3, 3]
+    assert [len(j) for j in jobs_of(make_toy, 1, True, 30)] == [30, 30]
+
+
+def test_others_are_a_job_each(make_toy):
+    assert [len(j) for j in jobs_of(make_toy, 2, False, 5)] == [1] * 10
+
+
+def test_the_command_line_explains_itself_and_refuses_in_a_line(tmp_path):
+    script = str(ROOT / "baselines" / "run_all.py")
+
+    def run(*arguments):
+        return subprocess.run(
+            [sys.executable, script, *arguments], cwd=tmp_path, capture_output=True, text=True
+        )
+
+    shown = run("--help")
+    assert shown.returncode == 0
+    assert "--preset" in shown.stdout
+    refused = run("--methods", "liner", "--output", "results")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("run_all.py: Unknown method 'liner'. Did you mean linear?")
+    assert not (tmp_path / "results").exists()
