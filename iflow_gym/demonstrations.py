@@ -181,13 +181,15 @@ class Demonstrations:
     @property
     def starts(self) -> FloatArray:
         """First sample of each recording, shape (n, d)."""
-        return np.stack([p[0] for p in self.positions])
+        first: FloatArray = np.stack([p[0] for p in self.positions])
+        return first
 
     @property
     def durations(self) -> FloatArray:
         """Time from the first to the last sample of each recording in seconds, shape (n,)."""
         steps = np.array([len(p) - 1 for p in self.positions], dtype=np.float64)
-        return steps * np.array(self.dt)
+        durations: FloatArray = steps * np.array(self.dt)
+        return durations
 
     @property
     def mean_dt(self) -> float:
@@ -207,7 +209,10 @@ class Demonstrations:
 
     def times(self, index: int) -> FloatArray:
         """Time stamps of recording `index` in seconds from its first sample, shape (T_i,)."""
-        return np.arange(len(self.positions[index])) * self.dt[index]
+        stamps: FloatArray = (
+            np.arange(len(self.positions[index]), dtype=np.float64) * self.dt[index]
+        )
+        return stamps
 
     @cached_property
     def sha256(self) -> str:

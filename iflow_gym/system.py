@@ -60,7 +60,7 @@ class DynamicalSystem(ABC):
     """The method's name in tables and files."""
     title: ClassVar[str]
     """The method's name as people write it."""
-    Config: ClassVar[type]
+    Config: ClassVar[type[Any]]
     """A frozen dataclass of the method's settings."""
     stochastic_fit: ClassVar[bool] = True
     """Whether the seed changes the fit."""
@@ -79,7 +79,7 @@ class DynamicalSystem(ABC):
             raise TypeError(
                 f"Unknown settings {unknown} for {type(self).__name__}; known: {', '.join(known)}."
             )
-        self.config: Any = dataclasses.replace(base, **settings)
+        self.config = dataclasses.replace(base, **settings)
 
     # Fitting ------------------------------------------------------------------------------
 

@@ -23,10 +23,8 @@ class Layer(NamedTuple):
     rotation: FloatArray
     hidden_weight: FloatArray
     hidden_bias: FloatArray
-    log_scale_weight: FloatArray
-    log_scale_bias: FloatArray
-    shift_weight: FloatArray
-    shift_bias: FloatArray
+    out_weight: FloatArray
+    out_bias: FloatArray
 
 
 class Flow:
@@ -48,23 +46,28 @@ class Flow:
         ]
         if (shapes := [v.shape for v in values]) != expected:
             raise ValueError(f"expected arrays {names} of shapes {expected}, got {shapes}")
-        self.layers = [
-            Layer(r, w, b, wo[:, :moved], bo[:, :moved], wo[:, moved:], bo[:, moved:])
-            for r, w, b, wo, bo in zip(*values, strict=True)
-        ]
+        self.layers = [Layer(*layer) for layer in zip(*values, strict=True)]
 
-    def _log_scale(self, layer: Layer, hidden: FloatArray) -> FloatArray:
-        raw = hidden @ layer.log_scale_weight + layer.log_scale_bias
-        return self.bound * np.tanh(raw / self.bound)
+    def _hidden(self, layer: Layer, kept: FloatArray) -> FloatArray:
+        hidden = kept @ layer.hidden_weight
+        hidden += layer.hidden_bias
+        return np.tanh(hidden, out=hidden)
+
+    def _coefficients(self, layer: Layer, hidden: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log-scale and shift, each (n, moved)."""
+        out = hidden @ layer.out_weight
+        out += layer.out_bias
+        n_moved = self.n_dims - self.n_kept
+        return self.bound * np.tanh(out[:, :n_moved] / self.bound), out[:, n_moved:]
 
     def forward(self, z: FloatArray) -> FloatArray:
         """Return y = h(z), (n, d)."""
         k = self.n_kept
         for layer in self.layers:
             z = z @ layer.rotation
-            hidden = np.tanh(z[:, :k] @ layer.hidden_weight + layer.hidden_bias)
-            z[:, k:] *= np.exp(self._log_scale(layer, hidden))
-            z[:, k:] += hidden @ layer.shift_weight + layer.shift_bias
+            log_scale, shift = self._coefficients(layer, self._hidden(layer, z[:, :k]))
+            z[:, k:] *= np.exp(log_scale)
+            z[:, k:] += shift
         return z
 
     def inverse(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -72,9 +75,8 @@ class Flow:
         k = self.n_kept
         z, log_det = y.copy(), np.zeros(len(y))
         for layer in reversed(self.layers):
-            hidden = np.tanh(z[:, :k] @ layer.hidden_weight + layer.hidden_bias)
-            log_scale = self._log_scale(layer, hidden)
-            z[:, k:] -= hidden @ layer.shift_weight + layer.shift_bias
+            log_scale, shift = self._coefficients(layer, self._hidden(layer, z[:, :k]))
+            z[:, k:] -= shift
             z[:, k:] *= np.exp(-log_scale)
             log_det -= log_scale.sum(axis=1)
             z = z @ layer.rotation.T
@@ -82,18 +84,17 @@ class Flow:
 
     def push_forward(self, z: FloatArray, dz: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return h(z) and the Jacobian-vector product J_h(z) dz, both (n, d)."""
-        k = self.n_kept
+        k, n_moved = self.n_kept, self.n_dims - self.n_kept
         for layer in self.layers:
             z, dz = z @ layer.rotation, dz @ layer.rotation
-            hidden = np.tanh(z[:, :k] @ layer.hidden_weight + layer.hidden_bias)
-            d_hidden = (1 - hidden**2) * (dz[:, :k] @ layer.hidden_weight)
-            log_scale = self._log_scale(layer, hidden)
-            d_log_scale = 1 - (log_scale / self.bound) ** 2
-            d_log_scale *= d_hidden @ layer.log_scale_weight
+            hidden = self._hidden(layer, z[:, :k])
+            log_scale, shift = self._coefficients(layer, hidden)
+            d_hidden = (1 - hidden * hidden) * (dz[:, :k] @ layer.hidden_weight)
+            d_out = d_hidden @ layer.out_weight
+            d_log_scale = (1 - (log_scale / self.bound) ** 2) * d_out[:, :n_moved]
             scale = np.exp(log_scale)
-            dz[:, k:] = scale * (dz[:, k:] + d_log_scale * z[:, k:])
-            dz[:, k:] += d_hidden @ layer.shift_weight
-            z[:, k:] = scale * z[:, k:] + hidden @ layer.shift_weight + layer.shift_bias
+            dz[:, k:] = scale * (dz[:, k:] + d_log_scale * z[:, k:]) + d_out[:, n_moved:]
+            z[:, k:] = scale * z[:, k:] + shift
         return z, dz
 
 
