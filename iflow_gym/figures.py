@@ -18,15 +18,17 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.plotting import DEMONSTRATION, GOAL, INK, ROLLOUT, plot_field
+from iflow_gym.plotting import DEMONSTRATION, GOAL, INK, PAPER, ROLLOUT, plot_field
 
 PALETTE = (
     "#0072b2",  # blue
@@ -44,6 +46,9 @@ REFERENCE_COLOUR = "#8a8578"
 
 MARKERS = {"proved": "o", "verified": "s", "sampled": "^", "none": "X"}
 """Marker of each kind of guarantee."""
+
+KEPT_COLOURS = (GOAL, INK, DEMONSTRATION, ROLLOUT, PAPER, "white", *PALETTE)
+"""Colours that a PNG's palette holds exactly, however few pixels have them."""
 
 TOLERABLE_DECADES = 0.7
 """Scores that span more decades than this get a logarithmic axis."""
@@ -264,7 +269,7 @@ def _place_labels(
     figure: Figure, ax: Axes, points: Sequence[Point], styles: Mapping[str, MethodStyle]
 ) -> None:
     """Write names beside points, each at the first of several places where nothing is yet."""
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()  # the layout, and with it every position in pixels, is known from here on
     figure.set_layout_engine("none")
     renderer = canvas.get_renderer()
@@ -306,8 +311,10 @@ def _place_labels(
                 ),
             )
             # Of the letters: the annotation's own extent would hold the line to the point, too.
+            text.update_positions(renderer)
             box = Text.get_window_extent(text, renderer).padded(1.5 * pixels)
-            inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and box.y0 >= frame.y0
+            inside = frame.containsx(box.x0) and frame.containsx(box.x1)
+            inside &= frame.containsy(box.y0) and frame.containsy(box.y1)
             if inside and not any(box.overlaps(other) for other in taken):
                 taken.append(box)
                 break
@@ -400,7 +407,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
     """Write a figure as SVG or PNG, by the path's suffix; the same figure gives the same bytes.
 
     An SVG holds no date, and ids that do not change from run to run. A PNG has a palette of 256
-    colours, which halves a sheet of fields and is not seen.
+    colours, which makes a sheet of fields a third as large and is not seen.
     """
     target = Path(path)
     if target.suffix == ".svg":
@@ -409,14 +416,30 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
         return target
     if target.suffix != ".png":
         raise ValueError(f"Expected a path that ends in .svg or .png, got {target}.")
+    figure.set_dpi(dpi)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    _save_with_palette(np.asarray(canvas.buffer_rgba())[..., :3], target)
+    return target
+
+
+def _save_with_palette(pixels: NDArray[np.uint8], target: Path) -> None:
+    """Write pixels, shape (height, width, 3), with the palette of their commonest colours.
+
+    Each pixel gets the nearest colour; Pillow's own search is approximate and tints white.
+    """
     from PIL import Image
 
-    figure.set_dpi(dpi)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    image.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
-    return target
+    kept = np.array([to_rgb(name) for name in KEPT_COLOURS]) * 255
+    common = Image.fromarray(pixels).quantize(256 - len(kept)).getpalette() or []
+    palette = np.vstack([np.rint(kept), np.reshape(common, (-1, 3))])[:256]
+    packed = pixels.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    colours, which = np.unique(packed, return_inverse=True)
+    unpacked = np.stack([colours >> 16, (colours >> 8) & 255, colours & 255], axis=1)
+    nearest = np.asarray(cKDTree(palette).query(unpacked)[1], dtype=np.uint8)
+    indexed = Image.fromarray(nearest[which.reshape(packed.shape)])
+    indexed.putpalette(palette.astype(np.uint8).tobytes())
+    indexed.save(target, optimize=True)
 
 
 # Axes ---------------------------------------------------------------------------------------

@@ -1,0 +1,208 @@
+"""Results as boards: one for each family and protocol, a row for each method, nothing dropped.
+
+A cell is (method, environment, seed). A cell that failed and a cell that was never run are both nan
+here: they count as missing, rank last, and are listed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
+from iflow_gym.metrics import Aggregate, aggregate_scores, get_metric, mean_ranks
+from iflow_gym.metrics.stability import GUARANTEES
+from iflow_gym.registration import lasa_id
+from iflow_gym.results import Result
+
+FAMILIES = {
+    "LASA-26": tuple(lasa_id(shape) for shape in SINGLE_MOTIONS),
+    "LASA-Multi": tuple(lasa_id(shape) for shape in MULTI_MODELS),
+}
+"""Environments that a family has, run or not; other families have those that were run."""
+
+RANKED = ("rmse", "frechet", "dtw", "swept_area", "seds_error", "direction_error")
+"""Metrics whose ranks the mean rank is the mean of: those of the accuracy table."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one family under one protocol."""
+
+    method: str
+    title: str
+    reference: bool
+    environments: tuple[str, ...]
+    """All that the family has."""
+    seeds: tuple[int, ...]
+    """All that the method was run with, on any environment of the board."""
+    cells: Mapping[tuple[str, int], Result]
+    """By environment and seed."""
+
+    @property
+    def n_expected(self) -> int:
+        """Cells that should have a score."""
+        return len(self.environments) * len(self.seeds)
+
+    @property
+    def n_scored(self) -> int:
+        """Cells that have scores."""
+        return sum(cell.ok for cell in self.cells.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every expected cell has scores."""
+        return self.n_scored == self.n_expected
+
+    @property
+    def coverage(self) -> str:
+        """As "24 of 26"."""
+        return f"{self.n_scored} of {self.n_expected}"
+
+    @property
+    def failed(self) -> list[Result]:
+        """Cells that were run and have no scores."""
+        return [cell for cell in self.cells.values() if not cell.ok]
+
+    @property
+    def n_never_run(self) -> int:
+        """Cells that have no record."""
+        return self.n_expected - len(self.cells)
+
+    @property
+    def guarantees(self) -> tuple[str, ...]:
+        """Kinds of guarantee that the cells state, weakest first."""
+        kinds = {cell.guarantee.kind for cell in self.cells.values() if cell.guarantee is not None}
+        return tuple(kind for kind in GUARANTEES if kind in kinds)
+
+    def applies(self, metric: str) -> bool:
+        """Whether any cell has a value of the metric."""
+        return any(cell.ok and cell.metrics.get(metric) is not None for cell in self.cells.values())
+
+    def scores(self, metric: str) -> dict[str, NDArray[np.float64]]:
+        """Return environment -> the seeds' scores, shape (S,), nan where there is none."""
+        return {
+            environment: np.array([self._score(metric, environment, seed) for seed in self.seeds])
+            for environment in self.environments
+        }
+
+    def _score(self, metric: str, environment: str, seed: int) -> float:
+        cell = self.cells.get((environment, seed))
+        value = cell.metrics.get(metric) if cell is not None and cell.ok else None
+        return np.nan if value is None else float(value)
+
+    def aggregate(self, metric: str) -> Aggregate | None:
+        """Return a metric over all cells; None where it does not apply to the method."""
+        return aggregate_scores(self.scores(metric)) if self.applies(metric) else None
+
+    def by_environment(self, metric: str) -> NDArray[np.float64]:
+        """Return means over the seeds, shape (E,); nan where a seed has no score."""
+        with np.errstate(invalid="ignore"):
+            return np.array([group.mean() for group in self.scores(metric).values()])
+
+
+@dataclass(frozen=True)
+class Board:
+    """All methods on one family under one protocol."""
+
+    family: str
+    protocol: str
+    environments: tuple[str, ...]
+    rows: tuple[Row, ...]
+    """Competitors by mean rank, best first; then the references by name."""
+
+    @property
+    def competitors(self) -> tuple[Row, ...]:
+        """Rows that are ranked."""
+        return tuple(row for row in self.rows if not row.reference)
+
+    @cached_property
+    def mean_rank(self) -> dict[str, float]:
+        """Competitor's name -> mean of its ranks over environments and `RANKED`."""
+        return ranks_of(self.competitors)
+
+    def best(self, values: Mapping[str, float], metric: str) -> set[str]:
+        """Return the methods whose value is the best, references left out.
+
+        Only rows that cover as many cells as the fullest one compete: a mean over the three
+        easiest environments is no better than one over all.
+        """
+        better = get_metric(metric).better if metric != "mean_rank" else "lower"
+        share = {row.method: row.n_scored / row.n_expected for row in self.competitors}
+        fullest = max(share.values(), default=0.0)
+        sign = 1.0 if better == "lower" else -1.0
+        fit = {
+            name: sign * value
+            for name, value in values.items()
+            if share.get(name) == fullest > 0 and not np.isnan(value)
+        }
+        return {name for name, value in fit.items() if value == min(fit.values())}
+
+
+def ranks_of(rows: Sequence[Row]) -> dict[str, float]:
+    """Return mean ranks of competitors over the environments that any of them was run on.
+
+    Of `RANKED`, the metrics that apply to every one of them: a policy that has no field to be asked
+    for velocities does not rank last for it. A method without any score ranks last by all.
+    """
+    if not rows:
+        return {}
+    tried = {environment for row in rows for environment, _ in row.cells}
+    kept = [i for i, environment in enumerate(rows[0].environments) if environment in tried]
+    ranks = [
+        mean_ranks(
+            np.stack([row.by_environment(metric)[kept] for row in rows]), get_metric(metric).better
+        )
+        for metric in RANKED
+        if (scored := [row for row in rows if row.n_scored])
+        and all(row.applies(metric) for row in scored)
+    ]
+    means = np.mean(ranks, axis=0) if ranks else np.full(len(rows), np.nan)
+    return {row.method: float(mean) for row, mean in zip(rows, means, strict=True)}
+
+
+def make_boards(results: Iterable[Result]) -> list[Board]:
+    """Return a board for each family and protocol that has results.
+
+    Families in the order of `FAMILIES`, then by name; reproduction before generalisation.
+    """
+    groups: dict[tuple[str, str], list[Result]] = {}
+    for result in results:
+        groups.setdefault((result.family, result.protocol), []).append(result)
+    known = list(FAMILIES)
+
+    def order(key: tuple[str, str]) -> tuple[int, str, bool]:
+        family, protocol = key
+        place = known.index(family) if family in known else len(known)
+        return place, family, protocol != "reproduction"
+
+    return [_board(*key, groups[key]) for key in sorted(groups, key=order)]
+
+
+def _board(family: str, protocol: str, results: Sequence[Result]) -> Board:
+    came = sorted({result.environment for result in results})
+    known = FAMILIES.get(family, ())
+    environments = (*known, *(e for e in came if e not in known))
+    rows = [
+        _row(environments, [r for r in results if r.method == method])
+        for method in sorted({result.method for result in results})
+    ]
+    ranks = ranks_of([row for row in rows if not row.reference])
+    rows.sort(key=lambda row: (row.reference, ranks.get(row.method, 0.0), row.method))
+    return Board(family, protocol, environments, tuple(rows))
+
+
+def _row(environments: tuple[str, ...], results: Sequence[Result]) -> Row:
+    first = results[0]
+    return Row(
+        method=first.method,
+        title=first.title,
+        reference=first.reference,
+        environments=environments,
+        seeds=tuple(sorted({result.seed for result in results})),
+        cells={(result.environment, result.seed): result for result in results},
+    )

@@ -1,0 +1,424 @@
+"""LEADERBOARD.md: tables that GitHub renders without scrolling, and what their numbers mean."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+
+from board import RANKED, Board
+from tables import (
+    BY_MEAN,
+    Aggregates,
+    aggregate_table,
+    aggregates,
+    escaped,
+    guarantee_of,
+    rank_of,
+    shape_name,
+    shape_table,
+    table,
+)
+
+from iflow_gym.baselines.registry import METHODS
+from iflow_gym.metrics import METRICS, get_metric, metrics_hash
+from iflow_gym.results import Result
+
+ACCURACY = RANKED
+"""Columns of the accuracy tables."""
+
+STABILITY = (
+    "converged",
+    "spurious_attractors",
+    "diverged",
+    "perturbation_recovery",
+    "lyapunov_violation",
+    "settling_time",
+)
+"""Columns of the stability table, after the guarantee."""
+
+COST = ("fit_seconds", "fit_cpu_seconds", "step_us", "n_parameters", "peak_memory_mb")
+"""Columns of the cost table."""
+
+DENSITY = ("velocity_rmse", "nll_1", "nll_10")
+"""Columns of the smaller table of what else is measured."""
+
+BY_SHAPE = ("frechet", "rmse", "dtw", "converged")
+"""Metrics that are tabled shape by shape."""
+
+SMALL = ("frechet", "rmse", "dtw", "seds_error", "converged", "spurious_attractors")
+"""Columns of a family that is reported beside the headline, in one table."""
+
+HEADLINE = "LASA-26"
+"""The family that has every table."""
+
+PROTOCOLS = {
+    "reproduction": "fitted on all demonstrations, rolled out from each one's start",
+    "generalisation": "fitted on demonstrations 1-4, scored on 5-7",
+}
+
+NOTES = {
+    ("LASA-Multi", "generalisation"): "These shapes hold two or three motions, one after another, "
+    "so that the recordings scored here are of motions that hardly any fitted one shows: the "
+    "numbers say what a method makes of unseen places, not how well it learned.",
+}
+"""What a reader of a family's table under a protocol must know."""
+
+
+# Notes --------------------------------------------------------------------------------------
+
+
+def footnote(board: Board, found: Aggregates) -> str:
+    """Say what the intervals are intervals of, and where cells are missing."""
+    drawn = {a.resampled for a in found.values() if a is not None} - {"nothing"}
+    what = {
+        "environments": "with one seed they resample the shapes, and say how much the choice of "
+        "shapes matters",
+        "seeds": "with several seeds they resample the seeds within each shape, and say how much "
+        "the seed matters",
+    }
+    who = {
+        name: sorted(
+            row.title
+            for row in board.rows
+            if any(
+                (a := found[row.method, m.name]) is not None and a.resampled == name
+                for m in METRICS
+            )
+        )
+        for name in ("environments", "seeds")
+    }
+    if drawn == {"environments"}:
+        text = f"Intervals are 95 % bootstrap intervals: {what['environments']}."
+    elif drawn == {"seeds"}:
+        text = f"Intervals are 95 % bootstrap intervals: {what['seeds']}."
+    elif not drawn:
+        text = "There are no intervals: one score is nothing to resample."
+    else:
+        text = (
+            f"Intervals are 95 % bootstrap intervals: {what['environments']} "
+            f"({', '.join(who['environments'])}); {what['seeds']} ({', '.join(who['seeds'])}). The "
+            "two kinds are not to be compared."
+        )
+    incomplete = [row for row in board.rows if not row.complete]
+    if incomplete:
+        text += " Incomplete: " + "; ".join(
+            f"{row.title} {row.coverage} ({len(row.failed)} failed, {row.n_never_run} never run)"
+            for row in incomplete
+        )
+        text += (
+            ". An incomplete row is aggregated over the cells it has, ranks last on the others, "
+        )
+        text += "and competes for the bold value only with rows as full."
+    return text
+
+
+def failures(boards: Sequence[Board]) -> list[str]:
+    """Return the section of cells that have no scores."""
+    lines = [
+        [
+            f"{row.title} on {shape_name(cell.environment)}, {board.protocol}, seed {cell.seed}",
+            _one_line(cell.reason or ""),
+        ]
+        for board in boards
+        for row in board.rows
+        for cell in row.failed
+    ]
+    never = [
+        f"- {row.title}: {row.n_never_run} of {row.n_expected} cells of {board.family}, "
+        f"{board.protocol}, were never run."
+        for board in boards
+        for row in board.rows
+        if row.n_never_run
+    ]
+    page = ["## Cells without scores", ""]
+    if not lines and not never:
+        return [*page, "None: every cell has scores.", ""]
+    if lines:
+        page += table(["Cell", "Reason"], lines)
+    return page + ([*never, ""] if never else [])
+
+
+def _one_line(reason: str) -> str:
+    first = reason.strip().splitlines()[0] if reason.strip() else "no reason given"
+    return escaped(first)
+
+
+def warnings_about(results: Sequence[Result]) -> list[str]:
+    """Return what makes the records hard to compare, one sentence each."""
+    found = []
+    current = metrics_hash()
+    hashes = {result.hashes.get("metrics", "none") for result in results if result.ok}
+    if len(hashes) > 1:
+        counts = Counter(r.hashes.get("metrics", "none") for r in results if r.ok)
+        listing = ", ".join(f"{name[:12]} ({n} cells)" for name, n in sorted(counts.items()))
+        found.append(
+            f"The records were scored by different versions of the metrics: {listing}. Their "
+            "numbers do not mean the same; run `python baselines/run_all.py` again."
+        )
+    elif hashes and hashes != {current}:
+        found.append(
+            f"The records were scored by metrics of hash {next(iter(hashes))[:12]}, this checkout "
+            f"has {current[:12]}; run `python baselines/run_all.py` again."
+        )
+    for label, what in (("core", "the suite's code"), ("data", "the data of one environment")):
+        if label == "data":
+            per = {}
+            for r in results:
+                per.setdefault(r.environment, set()).add(r.hashes.get("data"))
+            mixed = any(len(entries) > 1 for entries in per.values())
+        else:
+            mixed = len({r.hashes.get(label) for r in results if r.ok}) > 1
+        if mixed:
+            found.append(f"The records were made with different versions of {what}.")
+    for library in sorted({name for r in results for name in r.versions}):
+        used = sorted({r.versions[library] for r in results if library in r.versions})
+        if len(used) > 1:
+            found.append(f"The records were made with different versions of {library}: {used}.")
+    if len(presets := sorted({r.preset for r in results})) > 1:
+        found.append(f"The records are of different presets: {', '.join(presets)}.")
+    elif presets == ["smoke"]:
+        found.append("The records are of the smoke preset, whose few steps are no scores to quote.")
+    if len({str(r.hardware.get("cpu")) for r in results}) > 1:
+        found.append("The records were made on different processors: costs do not compare.")
+    return found
+
+
+# The page -----------------------------------------------------------------------------------
+
+
+def render(
+    boards: Sequence[Board],
+    results: Sequence[Result],
+    figures: Mapping[str, str],
+    units: Mapping[str, str],
+) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    boards
+        From `make_boards`.
+    results
+        The records that the boards are of.
+    figures
+        Name to path relative to the page, of the figures that were drawn.
+    units
+        Family to its unit of length.
+    """
+    page = ["# Leaderboard", ""]
+    page += [
+        "Methods that learn a motion from demonstrations, scored on the same ground. Lower is "
+        "better, but for *converged* and *recovery*. **Bold** is the best value among the "
+        "competitors; rows in *italics* are references and do not compete: *nearest demonstration* "
+        "is how far the recordings are from each other, *replay* plays the recording back.",
+        "",
+        "Written by `python leaderboard/build.py` from the records in "
+        "[`results/`](results); do not edit.",
+        "",
+    ]
+    if notes := warnings_about(results):
+        page += ["> [!WARNING]", *(f"> - {note}" for note in notes), ""]
+    page += _pictures(figures, ("accuracy-stability",))
+    for board in boards:
+        full = board.family == HEADLINE
+        page += board_section(board, units.get(board.family, "length"), full=full)
+        if full and board.protocol == "reproduction":
+            page += _pictures(figures, ("boxes", "accuracy-fit-time", "methods", "fields"))
+    page += shapes_section(boards)
+    page += failures(boards)
+    page += about(results, boards, units)
+    return "\n".join(page).rstrip() + "\n"
+
+
+CAPTIONS = {
+    "accuracy-stability": "Accuracy against stability on LASA-26, reproduction: to the upper left "
+    "a method follows the demonstrations and ends where they end. Bars are 95 % intervals.",
+    "boxes": "The four measures of the ImitationFlow paper's figure 3 over the LASA-26 shapes, a "
+    "point for each shape; the dashed line is the median distance between the demonstrations.",
+    "accuracy-fit-time": "Accuracy against the time to fit, LASA-26, reproduction.",
+    "methods": "One shape by every method: demonstrations in orange, reproductions in green, "
+    "streamlines of the learned field in blue.",
+    "fields": "Every shape, as learned by ImitationFlow: demonstrations in orange, rollouts from "
+    "their starts in green.",
+}
+"""By name of the figure."""
+
+
+def _pictures(figures: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    lines: list[str] = []
+    for name in names:
+        if name in figures:
+            lines += [f"![{CAPTIONS[name]}]({figures[name]})", "", f"*{CAPTIONS[name]}*", ""]
+    return lines
+
+
+def board_section(board: Board, length_unit: str, *, full: bool) -> list[str]:
+    """Return a board's tables: all of them, or one for a family beside the headline."""
+    found = aggregates(board)
+    page = [f"## {board.family}: {board.protocol}", ""]
+    page += [f"{len(board.environments)} shapes, {PROTOCOLS[board.protocol]}.", ""]
+    if note := NOTES.get((board.family, board.protocol)):
+        page += [note, ""]
+    first = {
+        "Mean rank": lambda row: rank_of(board, row),
+        "Cells": lambda row: row.coverage,
+    }
+    if not full:
+        guarantee = {**first, "Guarantee": guarantee_of}
+        page += aggregate_table(board, found, SMALL, length_unit, extra=guarantee)
+        return [*page, f"<sub>{_statistics(SMALL)} {footnote(board, found)}</sub>", ""]
+    page += ["### Accuracy", "", "Interquartile mean over the shapes:", ""]
+    page += aggregate_table(board, found, ACCURACY, length_unit, statistic="iqm", extra=first)
+    page += ["Mean over the shapes:", ""]
+    page += aggregate_table(board, found, ACCURACY, length_unit, statistic="mean")
+    page += [f"<sub>{footnote(board, found)}</sub>", ""]
+    page += ["### Stability", ""]
+    page += aggregate_table(
+        board, found, STABILITY, length_unit, extra={"Guarantee": guarantee_of}, references=False
+    )
+    page += [f"<sub>{_statistics(STABILITY)}</sub>", ""]
+    page += ["### Velocities and densities", ""]
+    page += aggregate_table(board, found, DENSITY, length_unit, references=False)
+    page += [f"<sub>{_statistics(DENSITY)}</sub>", ""]
+    page += ["### Cost", ""]
+    page += aggregate_table(board, found, COST, length_unit, references=False)
+    page += [f"<sub>{_statistics(COST)} {_batches(board)}</sub>", ""]
+    return page
+
+
+def _statistics(metrics: Sequence[str]) -> str:
+    """Say which statistic the columns of a table are."""
+    means = [get_metric(m).title for m in metrics if m in BY_MEAN]
+    if not means:
+        return "Interquartile means over the shapes."
+    return f"Means over the shapes: {', '.join(means)}. Interquartile means: the others."
+
+
+def _batches(board: Board) -> str:
+    together = []
+    for row in board.rows:
+        sizes = [float(c.fit.get("batch_size") or 1) for c in row.cells.values() if c.ok]
+        if sizes and max(sizes) > 1:
+            together.append(f"{row.title} (up to {max(sizes):.0f} together)")
+    if not together:
+        return ""
+    return (
+        "A method that fits several shapes together counts each shape's share of the time: "
+        f"{', '.join(together)}."
+    )
+
+
+def shapes_section(boards: Sequence[Board]) -> list[str]:
+    """Return every shape's own numbers, folded."""
+    page = ["## Shape by shape", ""]
+    for board in boards:
+        for metric in BY_SHAPE:
+            title = f"{board.family}, {board.protocol}: {get_metric(metric).title}"
+            page += [f"<details><summary>{title}</summary>", "", *shape_table(board, metric)]
+            page += ["</details>", ""]
+    return page
+
+
+def about(
+    results: Sequence[Result], boards: Sequence[Board], units: Mapping[str, str]
+) -> list[str]:
+    """Return what the numbers mean and how to make them again."""
+    page = ["## About these numbers", ""]
+    page += [f"- **{name}**: {what}." for name, what in PROTOCOLS.items()]
+    page += [
+        "- **Integration**: the environment is the judge. A policy gives a velocity command that "
+        "the environment holds for one sample time of the demonstration: "
+        + _times(results)
+        + ". A method whose flow is exact commands the velocity that leads to its own next state.",
+        "- **Units**: " + "; ".join(f"{f} lengths in {u}" for f, u in units.items()) + ".",
+        "- **Aggregates**: the interquartile mean is the mean of the middle half of the scores. A "
+        "score of ∞ is a runaway and counts. The mean rank is taken over environments and over "
+        + ", ".join(get_metric(m).title for m in RANKED)
+        + ", those that apply to every competitor; a cell without scores ranks last.",
+        "- **Guarantee**: *proved* by construction for every state, *verified* on a bounded region "
+        "with an error bound, *sampled* where it was tried, or *none*. The methods' own "
+        "reasons, as given for the first shape:",
+    ]
+    page += [f"  - {reason}" for reason in _reasons(boards)]
+    page += [
+        f"- **Preset**: {', '.join(sorted({r.preset for r in results}))}; records made "
+        + _span(r.created for r in results)
+        + ".",
+        "- **Metrics**: hash "
+        + ", ".join(f"`{h[:16]}`" for h in sorted({r.hashes.get("metrics", "") for r in results}))
+        + ", over the code that computes them.",
+        "- **Hardware**: " + "; ".join(_hardware(results)) + ".",
+        "- **Versions**: " + ", ".join(_versions(results)) + ".",
+        "",
+        "To make these numbers again:",
+        "",
+        "```console",
+        "$ pip install -c constraints.txt -e .",
+        *_commands(results),
+        "$ python leaderboard/build.py",
+        "```",
+        "",
+        "<details><summary>What each number is</summary>",
+        "",
+    ]
+    definitions = [[m.title, m.unit, m.better, escaped(m.definition)] for m in METRICS]
+    page += table(["Metric", "Unit", "Better", "Definition"], definitions)
+    return [*page, "</details>", ""]
+
+
+def _times(results: Sequence[Result]) -> str:
+    dts = [result.dt for result in results if result.dt is not None]
+    spread = f"{min(dts) * 1000:.1f} to {max(dts) * 1000:.1f} ms" if dts else "not recorded"
+    integrators: dict[str, set[str]] = {}
+    for result in results:
+        if result.integrator is not None:
+            integrators.setdefault(result.integrator, set()).add(result.title)
+    kinds = "; ".join(f"{k}: {', '.join(sorted(v))}" for k, v in sorted(integrators.items()))
+    return f"{spread}, by shape ({kinds or 'integrators not recorded'})"
+
+
+def _reasons(boards: Sequence[Board]) -> list[str]:
+    """Return each competitor's reason, from the first cell that states one."""
+    reasons: dict[str, str] = {}
+    for board in boards:
+        for row in board.competitors:
+            for cell in row.cells.values():
+                if cell.guarantee is not None:
+                    text = escaped(cell.guarantee.reason).rstrip(".")
+                    reasons.setdefault(row.title, f"{row.title}, *{cell.guarantee.kind}*: {text}.")
+    return [reasons[title] for title in sorted(reasons)]
+
+
+def _span(created: Iterable[str]) -> str:
+    days = sorted(stamp[:10] for stamp in created)
+    return days[0] if days[0] == days[-1] else f"{days[0]} to {days[-1]}"
+
+
+def _hardware(results: Sequence[Result]) -> list[str]:
+    return sorted(
+        {
+            f"{h.get('cpu')}, {h.get('cores')} cores, {h.get('threads')} thread(s) a fit, "
+            f"{h.get('platform')}"
+            for h in (result.hardware for result in results)
+        }
+    )
+
+
+def _versions(results: Sequence[Result]) -> list[str]:
+    used: dict[str, set[str]] = {}
+    for result in results:
+        for name, version in result.versions.items():
+            used.setdefault(name, set()).add(version)
+    return [f"{name} {'/'.join(sorted(used[name]))}" for name in sorted(used)]
+
+
+def _commands(results: Sequence[Result]) -> list[str]:
+    """Return the run for each preset, naming the methods that are not in the registry."""
+    foreign = sorted({r.method for r in results if not r.reference} - set(METHODS))
+    lines = [
+        f"$ python baselines/run_all.py --preset {preset} --output leaderboard/results"
+        for preset in sorted({r.preset for r in results})
+    ]
+    if foreign:
+        lines.append(f"# and --methods package.module:Class for {', '.join(foreign)}")
+    return lines

@@ -1,0 +1,245 @@
+"""Markdown tables of a board: a row for each method, or for each shape."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from board import Board, Row
+
+from iflow_gym.metrics import METRICS, Aggregate, get_metric
+from iflow_gym.metrics.aggregate import Interval
+from iflow_gym.results import short_name
+
+PERCENT = frozenset({"converged", "diverged", "perturbation_recovery", "lyapunov_violation"})
+"""Fractions that are shown in percent."""
+
+
+BY_MEAN = PERCENT | {"spurious_attractors"}
+"""Metrics of which a table shows the mean: an interquartile mean would hide the shapes that fail
+just where that is what is asked."""
+
+
+ROUNDING = 1e-9
+"""Numbers below this are what is left of a difference of equal numbers."""
+
+
+Aggregates = dict[tuple[str, str], "Aggregate | None"]
+"""By method and metric."""
+
+
+# Numbers ------------------------------------------------------------------------------------
+
+
+def number(value: float | None) -> str:
+    """Return three significant digits, "∞" for a runaway, "≈ 0" for rounding, "–" for nothing."""
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    if value == 0:
+        return "0"
+    if abs(value) < ROUNDING:
+        return "≈ 0"
+    if abs(value) < 1e-3 or abs(value) >= 1e6:
+        return f"{value:.1e}"
+    if value == int(value):
+        return f"{value:.0f}"
+    decimals = max(0, 2 - math.floor(math.log10(abs(value))))
+    return f"{value:.{decimals}f}"
+
+
+def percent(value: float | None) -> str:
+    """Return a fraction in percent; 100 and 0 are exact, never rounded to."""
+    if value is None or math.isnan(value):
+        return "–"
+    if value in (0.0, 1.0):
+        return f"{100 * value:.0f}"
+    return f"{min(max(100 * value, 0.01), 99.99):.2f}"
+
+
+def shown(metric: str, value: float | None) -> str:
+    """Return a value as its metric is shown."""
+    return percent(value) if metric in PERCENT else number(value)
+
+
+def heading(metric: str, length_unit: str) -> str:
+    """Return a metric's title with its unit, for a column."""
+    found = get_metric(metric)
+    if metric in PERCENT:
+        return f"{found.title} (%)"
+    unit = found.unit.replace("length", length_unit)
+    short = {"demonstration durations": "durations", "-": ""}.get(unit, unit)
+    return f"{found.title} ({short})" if short else found.title
+
+
+TEXT_COLUMNS = frozenset(
+    {"Method", "Shape", "Guarantee", "Cell", "Reason", "Metric", "Unit", "Better", "Definition"}
+)
+"""Headings of columns that are aligned to the left."""
+
+
+def table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
+    """Return a Markdown table; numbers are aligned to the right."""
+    rule = ["---" if name in TEXT_COLUMNS else "---:" for name in header]
+    return [f"| {' | '.join(cells)} |" for cells in (header, rule, *lines)] + [""]
+
+
+def escaped(text: str) -> str:
+    """Return text without what Markdown would take for a table, a tag or emphasis."""
+    for character, escape in (("|", "\\|"), ("<", "&lt;"), ("*", "\\*")):
+        text = text.replace(character, escape)
+    return text
+
+
+# Tables of a board --------------------------------------------------------------------------
+
+
+def aggregates(board: Board) -> Aggregates:
+    """Return every row's aggregate of every metric; the bootstrap runs once for each."""
+    return {
+        (row.method, metric.name): row.aggregate(metric.name)
+        for row in board.rows
+        for metric in METRICS
+    }
+
+
+def aggregate_table(
+    board: Board,
+    found: Aggregates,
+    metrics: Sequence[str],
+    length_unit: str,
+    *,
+    statistic: str | None = None,
+    extra: Mapping[str, Callable[[Row], str]] | None = None,
+    references: bool = True,
+) -> list[str]:
+    """Return a table of aggregates, a row for each method.
+
+    Parameters
+    ----------
+    board, found
+        The board and its `aggregates`.
+    metrics
+        Columns.
+    length_unit
+        What "length" is in.
+    statistic
+        "mean" or "iqm" for all columns; None takes the mean for `BY_MEAN` and else the iqm.
+    extra
+        Columns before the metrics: heading to a function of a row.
+    references
+        Whether rows that do not compete are in it.
+    """
+    columns: list[dict[str, str]] = []
+    for metric in metrics:
+        chosen = statistic or ("mean" if metric in BY_MEAN else "iqm")
+        values = {
+            row.method: getattr(aggregate, chosen)
+            for row in board.rows
+            if (aggregate := found[row.method, metric]) is not None
+        }
+        best = {shown(metric, values[name]) for name in board.best(values, metric)}
+        eligible = eligible_methods(board)
+        column = {}
+        for row in board.rows:
+            aggregate = found[row.method, metric]
+            text = "–" if aggregate is None else shown(metric, getattr(aggregate, chosen))
+            if row.method in eligible and text in best:
+                text = f"**{text}**"
+            if aggregate is not None:
+                text += interval(metric, getattr(aggregate, f"{chosen}_interval"), text)
+            column[row.method] = text
+        columns.append(column)
+    before = extra or {}
+    header = ["Method", *before, *(heading(metric, length_unit) for metric in metrics)]
+    lines = [
+        emphasised(
+            row,
+            [
+                row.title,
+                *(function(row) for function in before.values()),
+                *(column[row.method] for column in columns),
+            ],
+        )
+        for row in board.rows
+        if references or not row.reference
+    ]
+    return table(header, lines)
+
+
+def eligible_methods(board: Board) -> set[str]:
+    """Return the competitors that may have the best value: those that cover the most cells."""
+    return board.best(dict.fromkeys((row.method for row in board.competitors), 0.0), "mean_rank")
+
+
+def interval(metric: str, ends: Interval, value: str) -> str:
+    """Return an interval for below its number; nothing where it is none, or the number itself."""
+    low, high = (shown(metric, end) for end in ends)
+    if "–" in (low, high) or low == high == value.strip("*"):
+        return ""
+    return f"<br><sub>{low} to {high}</sub>"
+
+
+def emphasised(row: Row, cells: Sequence[str]) -> list[str]:
+    """Return a row's cells: in italics for a reference."""
+    if not row.reference:
+        return list(cells)
+    return [_italic(cell) for cell in cells]
+
+
+def _italic(cell: str) -> str:
+    value, rule, rest = cell.partition("<br>")
+    return cell if value in ("", "–") else f"*{value}*{rule}{rest}"
+
+
+def rank_of(board: Board, row: Row) -> str:
+    """Return a row's mean rank, bold if it is the best; nothing for a reference."""
+    if row.reference:
+        return ""
+    text = f"{board.mean_rank[row.method]:.2f}"
+    return f"**{text}**" if row.method in board.best(board.mean_rank, "mean_rank") else text
+
+
+def guarantee_of(row: Row) -> str:
+    """Return the weakest kind of guarantee of the cells, and how many state a stronger one."""
+    if not row.guarantees:
+        return "–"
+    if len(row.guarantees) == 1:
+        return row.guarantees[0]
+    counts = Counter(cell.guarantee.kind for cell in row.cells.values() if cell.guarantee)
+    return ", ".join(f"{kind} ({counts[kind]})" for kind in row.guarantees)
+
+
+def shape_table(board: Board, metric: str) -> list[str]:
+    """Return a table of one metric, a row for each environment, a column for each method."""
+    rows = [row for row in board.rows if row.applies(metric) or not row.reference]
+    values = {row.method: row.by_environment(metric) for row in rows}
+    lines = []
+    for i, environment in enumerate(board.environments):
+        here = {row.method: float(values[row.method][i]) for row in rows if not row.reference}
+        finite = [value for value in here.values() if not math.isnan(value)]
+        better = get_metric(metric).better
+        best = (min if better == "lower" else max)(finite) if finite else math.nan
+        cells = []
+        for row in rows:
+            text = shown(metric, float(values[row.method][i]))
+            if text == "–" and any((environment, seed) in row.cells for seed in row.seeds):
+                ran = [
+                    row.cells[environment, s] for s in row.seeds if (environment, s) in row.cells
+                ]
+                text = "failed" if not all(cell.ok for cell in ran) else "–"
+            if row.reference:
+                text = _italic(text)
+            elif text not in ("–", "failed") and text == shown(metric, best):
+                text = f"**{text}**"
+            cells.append(text)
+        lines.append([shape_name(environment), *cells])
+    titles = [f"*{row.title}*" if row.reference else row.title for row in rows]
+    return table(["Shape", *titles], lines)
+
+
+def shape_name(environment: str) -> str:
+    """Return the name of the motion in an id."""
+    return short_name(environment).removeprefix("LASA-").rpartition("-v")[0]

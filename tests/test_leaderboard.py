@@ -1,0 +1,455 @@
+"""The leaderboard: what it says of results that are made up, so that the truth is known."""
+
+import importlib
+import importlib.util
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+
+from iflow_gym.baselines.linear import StableLinear
+from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS, load_lasa
+from iflow_gym.figures import (
+    PALETTE,
+    Point,
+    box_figure,
+    method_styles,
+    save_figure,
+    scatter_figure,
+)
+from iflow_gym.metrics import METRICS, metrics_hash
+from iflow_gym.plotting import GOAL
+from iflow_gym.registration import lasa_id
+from iflow_gym.results import Result, write_result
+from iflow_gym.system import Guarantee
+
+LEADERBOARD = Path(__file__).parents[1] / "leaderboard"
+
+
+@pytest.fixture(scope="module")
+def builder():
+    """leaderboard/build.py, as the script finds its neighbours, under a name of its own."""
+    sys.path.insert(0, str(LEADERBOARD))
+    try:
+        spec = importlib.util.spec_from_file_location("_leaderboard", LEADERBOARD / "build.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        module.tables = importlib.import_module("tables")
+    finally:
+        sys.path.remove(str(LEADERBOARD))
+    return module
+
+
+def record(method, shape, scale=1.0, **changes):
+    """Return a record whose every score is `scale` times a number that depends on the shape."""
+    shapes = [*SINGLE_MOTIONS, *MULTI_MODELS]
+    value = scale * (1 + shapes.index(shape) / 10)
+    metrics = {m.name: value for m in METRICS} | {"converged": min(1.0, 1 / scale)}
+    metrics |= {"diverged": 0.0, "perturbation_recovery": 0.5, "lyapunov_violation": None}
+    fields = {
+        "method": method,
+        "title": method.capitalize(),
+        "environment": lasa_id(shape),
+        "family": "LASA-26" if shape in SINGLE_MOTIONS else "LASA-Multi",
+        "protocol": "reproduction",
+        "seed": 0,
+        "preset": "standard",
+        "status": "ok",
+        "key": "k",
+        "created": "2026-01-02T03:04:05+00:00",
+        "metrics": metrics,
+        "guarantee": Guarantee("proved", "made up for a test"),
+        "integrator": "exact",
+        "dt": 0.005,
+        "fit": {"batch_size": 1},
+        "hashes": {"metrics": metrics_hash(), "core": "c", "data": shape},
+        "versions": {"python": "3.12", "numpy": "2.0"},
+        "hardware": {"cpu": "abacus", "cores": 2, "threads": 1, "platform": "wood"},
+    }
+    return Result(**{**fields, **changes})
+
+
+def failed(method, shape, reason="RuntimeError: it | broke\nfile.py:1", **changes):
+    return record(
+        method, shape, status="failed", reason=reason, metrics={}, guarantee=None, **changes
+    )
+
+
+def sweep(method, scale=1.0, shapes=SINGLE_MOTIONS, **changes):
+    return [record(method, shape, scale, **changes) for shape in shapes]
+
+
+def boards_of(builder, results):
+    return builder.make_boards(results)
+
+
+def render(builder, results):
+    return builder.render(boards_of(builder, results), results, {}, {"LASA-26": "mm"})
+
+
+def section(text, title, level="### "):
+    """Return the part of a page under a heading."""
+    start = text.index(level + title)
+    end = text.find("\n" + level, start + 1)
+    return text[start : end if end > 0 else None]
+
+
+def rows_of(text):
+    """Return the header of a text's first table, and its rows by their first column."""
+    lines = text[text.index("\n|") + 1 :].split("\n\n")[0].splitlines()
+    table = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    return table[0], {row[0].strip("*"): row for row in table[2:]}
+
+
+# Boards -------------------------------------------------------------------------------------
+
+
+def test_cells_never_run_count_as_missing(builder):
+    (board,) = boards_of(builder, sweep("good", shapes=SINGLE_MOTIONS[:24]))
+    (row,) = board.rows
+    assert (row.n_scored, row.n_expected, row.coverage) == (24, 26, "24 of 26")
+    assert row.n_never_run == 2
+    assert row.aggregate("rmse").coverage == "24 of 26"
+
+
+def test_three_seeds_make_three_times_as_many_cells(builder):
+    results = [r for seed in range(3) for r in sweep("good", seed=seed)]
+    (board,) = boards_of(builder, results)
+    assert board.rows[0].coverage == "78 of 78"
+    assert board.rows[0].aggregate("rmse").resampled == "seeds"
+
+
+def test_a_failed_cell_ranks_last_and_stays(builder):
+    results = sweep("good", 1.0) + sweep("bad", 2.0)
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"good": 1.0, "bad": 2.0}
+    assert [row.method for row in board.rows] == ["good", "bad"]
+    broken = [failed("good", s) for s in SINGLE_MOTIONS[:20]]
+    broken += sweep("good", 1.0, shapes=SINGLE_MOTIONS[20:]) + sweep("bad", 2.0)
+    (board,) = boards_of(builder, broken)
+    assert board.mean_rank == pytest.approx({"good": (6 + 20 * 2) / 26, "bad": (12 + 20) / 26})
+    assert [row.method for row in board.rows] == ["bad", "good"]
+    assert len(board.rows[1].failed) == 20
+
+
+def test_a_metric_that_no_field_means_no_last_rank(builder):
+    """A policy without a velocity field has no SEDS error; ranks are taken where all have one."""
+    blind = [
+        record("blind", s, 0.5, metrics={**record("x", s, 0.5).metrics, "seds_error": None})
+        for s in SINGLE_MOTIONS
+    ]
+    (board,) = boards_of(builder, blind + sweep("good"))
+    assert board.mean_rank == {"blind": 1.0, "good": 2.0}
+    assert board.rows[0].aggregate("seds_error") is None
+
+
+def test_references_are_below_and_have_no_rank(builder):
+    results = sweep("replay", 0.01, reference=True, guarantee=None) + sweep("slow", 3.0)
+    (board,) = boards_of(builder, results)
+    assert [row.method for row in board.rows] == ["slow", "replay"]
+    assert board.mean_rank == {"slow": 1.0}
+    assert board.best({"replay": 0.01, "slow": 3.0}, "rmse") == {"slow"}
+
+
+def test_the_best_of_a_metric_that_is_better_higher(builder):
+    (board,) = boards_of(builder, sweep("a", 1.0) + sweep("b", 2.0))
+    assert board.best({"a": 0.9, "b": 0.4}, "converged") == {"a"}
+    assert board.best({"a": 0.9, "b": 0.4}, "rmse") == {"b"}
+    assert board.best({"a": math.nan, "b": 0.4}, "rmse") == {"b"}
+    assert board.best({"a": 1.0, "b": 1.0}, "rmse") == {"a", "b"}
+
+
+def test_a_row_with_three_easy_shapes_does_not_win(builder):
+    results = sweep("full", 2.0) + sweep("cherry", 0.1, shapes=SINGLE_MOTIONS[:3])
+    (board,) = boards_of(builder, results)
+    assert board.best({"full": 2.0, "cherry": 0.1}, "rmse") == {"full"}
+    text = section(render(builder, results), "Accuracy")
+    header, rows = rows_of(text)
+    place = header.index("RMSE (mm)")
+    assert rows["Full"][place].startswith("**")
+    assert not rows["Cherry"][place].startswith("**")
+    assert rows["Cherry"][header.index("Cells")] == "3 of 26"
+
+
+def test_boards_come_in_order(builder):
+    results = [
+        record("a", "Multi_Models_1"),
+        record("a", "Angle", protocol="generalisation"),
+        record("a", "Angle"),
+        record("a", "Angle", environment="iflow/Other-v0", family="Other"),
+    ]
+    keys = [(board.family, board.protocol) for board in boards_of(builder, results)]
+    assert keys == [
+        ("LASA-26", "reproduction"),
+        ("LASA-26", "generalisation"),
+        ("LASA-Multi", "reproduction"),
+        ("Other", "reproduction"),
+    ]
+
+
+# Numbers ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (2.1549, "2.15"), (0.0266, "0.0266"), (134.2, "134"), (8.0, "8"), (0.0, "0"),
+        (12345.6, "12346"), (1.5e7, "1.5e+07"), (2e-5, "2.0e-05"), (2e-14, "≈ 0"), (math.inf, "∞"),
+        (math.nan, "–"), (None, "–"),
+    ],
+)  # fmt: skip
+def test_numbers(builder, value, text):
+    assert builder.tables.shown("rmse", value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.0, "100"), (0.99999, "99.99"), (0.0, "0"), (1e-6, "0.01"), (0.5, "50.00"), (None, "–")],
+)
+def test_percentages_never_round_to_all_or_nothing(builder, value, text):
+    assert builder.tables.shown("converged", value) == text
+
+
+# The page -----------------------------------------------------------------------------------
+
+
+def test_bold_is_the_best_competitor_and_references_are_italic(builder):
+    results = sweep("good", 1.0) + sweep("bad", 2.0)
+    results += sweep("replay", 0.01, reference=True, guarantee=None)
+    header, rows = rows_of(section(render(builder, results), "Accuracy"))
+    place = header.index("Fréchet (mm)")
+    assert rows["Good"][place].startswith("**")
+    assert not rows["Bad"][place].startswith("*")
+    assert rows["replay".capitalize()][0] == "*Replay*"
+    reference = rows["Replay"][place]
+    assert reference.startswith("*")
+    assert not reference.startswith("**")
+    assert rows["Replay"][header.index("Mean rank")] == ""
+
+
+def test_numbers_of_the_page_are_the_aggregates(builder):
+    values = [1 + i / 10 for i in range(26)]
+    header, rows = rows_of(section(render(builder, sweep("good")), "Accuracy"))
+    iqm = np.mean(sorted(values)[6:20])
+    assert rows["Good"][header.index("RMSE (mm)")].startswith(f"**{iqm:.2f}**<br><sub>")
+
+
+def test_intervals_say_what_they_resample(builder):
+    one = render(builder, sweep("good"))
+    assert "with one seed they resample the shapes" in one
+    assert "with several seeds" not in one
+    three = [r for seed in range(3) for r in sweep("good", 1 + seed / 9, seed=seed)]
+    assert "with several seeds they resample the seeds within each shape" in render(builder, three)
+    mixed = render(builder, three + sweep("still"))
+    assert "(Still)" in mixed
+    assert "not to be compared" in mixed
+
+
+def test_failed_cells_are_listed_with_their_reasons(builder):
+    results = [*sweep("good", shapes=SINGLE_MOTIONS[1:]), failed("good", "Angle")]
+    text = render(builder, results)
+    assert "| Good on Angle, reproduction, seed 0 | RuntimeError: it \\| broke |" in text
+    assert "25 of 26 (1 failed, 0 never run)" in text
+    header, rows = rows_of(text[text.index("Fréchet</summary>") :])
+    assert rows["Angle"][header.index("Good")] == "failed"
+
+
+def test_a_method_that_only_failed_is_still_there(builder):
+    results = sweep("good") + [failed("dead", s) for s in SINGLE_MOTIONS]
+    header, rows = rows_of(section(render(builder, results), "Accuracy"))
+    assert rows["Dead"][header.index("Cells")] == "0 of 26"
+    assert rows["Dead"][header.index("RMSE (mm)")] == "–"
+    assert rows["Dead"][header.index("Mean rank")] == "2.00"
+
+
+def test_cells_never_run_are_said(builder):
+    text = render(builder, sweep("good", shapes=SINGLE_MOTIONS[:2]))
+    assert "Good: 24 of 26 cells of LASA-26, reproduction, were never run" in text
+
+
+def test_a_runaway_counts(builder):
+    results = sweep("good", shapes=SINGLE_MOTIONS[1:])
+    results += [record("good", "Angle", metrics={**results[0].metrics, "rmse": math.inf})]
+    text = render(builder, results)
+    mean = text[text.index("Mean over the shapes:") :]
+    header, rows = rows_of(mean)
+    assert rows["Good"][header.index("RMSE (mm)")].startswith("**∞**")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hashes": {"metrics": "other"}}, "scored by different versions of the metrics"),
+        ({"versions": {"python": "3.12", "numpy": "1.26"}}, "different versions of numpy"),
+        ({"preset": "full"}, "of different presets: full, standard"),
+        ({"hardware": {"cpu": "mill"}}, "on different processors"),
+    ],
+)
+def test_records_that_do_not_compare_are_warned_of(builder, changes, message):
+    results = sweep("good") + sweep("new", **changes)
+    text = render(builder, results)
+    assert message in section(text, "Leaderboard", "# ").split("##")[0]
+    assert "> [!WARNING]" in text
+
+
+def test_records_of_other_metrics_than_the_checkouts_are_warned_of(builder):
+    text = render(builder, sweep("good", hashes={"metrics": "old"}))
+    assert "this checkout has" in text
+
+
+def test_records_that_compare_are_not_warned_of(builder):
+    assert "WARNING" not in render(builder, sweep("good") + sweep("other", 2.0))
+
+
+def test_tables_have_as_many_cells_in_every_row(builder):
+    results = sweep("good") + [failed("odd", s) for s in SINGLE_MOTIONS[:3]]
+    results += [record("good", s) for s in MULTI_MODELS]
+    text = render(builder, results)
+    for block in text.split("\n\n"):
+        lines = [line for line in block.splitlines() if line.startswith("|")]
+        widths = {line.replace("\\|", "").count("|") for line in lines}
+        assert len(widths) <= 1, block
+
+
+# Files --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def results_folder(tmp_path):
+    """Records of two methods, one of them with a fitted model on one shape."""
+    folder = tmp_path / "results"
+    for result in sweep("gmr", 2.0, guarantee=Guarantee("none", "made up")):
+        write_result(folder, result)
+    for result in sweep("linear", 1.0, model="LASA-Sshape-v0.model.safetensors"):
+        write_result(folder, result)
+    system = StableLinear().fit(load_lasa("Sshape"), seed=0)
+    system.save(folder / "linear" / "LASA-Sshape-v0.model.safetensors")
+    return folder
+
+
+def test_the_same_results_give_the_same_bytes(builder, results_folder, tmp_path):
+    written = [builder.build(results_folder, tmp_path / name) for name in ("a", "b")]
+    names = [[path.name for path in paths] for paths in written]
+    assert names[0] == names[1]
+    assert set(names[0]) == {
+        "LEADERBOARD.md",
+        "accuracy-stability.svg",
+        "accuracy-fit-time.svg",
+        "boxes.svg",
+        "methods.png",
+    }
+    for first, second in zip(*written, strict=True):
+        assert first.read_bytes() == second.read_bytes(), first.name
+
+
+def test_every_picture_of_the_page_is_there(builder, results_folder, tmp_path):
+    page, *figures = builder.build(results_folder, tmp_path / "out")
+    text = page.read_text(encoding="utf-8")
+    for figure in figures:
+        assert f"(figures/{figure.name})" in text
+    assert text.count("![") == len(figures)
+
+
+def test_figures_hold_no_date(builder, results_folder, tmp_path):
+    _, *figures = builder.build(results_folder, tmp_path / "out")
+    for figure in figures:
+        if figure.suffix == ".svg":
+            assert "dc:date" not in figure.read_text(encoding="utf-8")
+
+
+def run_script(*arguments):
+    return subprocess.run(
+        [sys.executable, str(LEADERBOARD / "build.py"), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_nothing_to_build_is_said(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for folder, message in (
+        (tmp_path / "absent", "Expected a folder of results"),
+        (tmp_path / "empty", "Expected records in"),
+    ):
+        done = run_script("--results", folder, "--output", tmp_path / "out")
+        assert done.returncode == 2
+        assert message in done.stderr
+        assert "run_all.py" in done.stderr
+        assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_script_prints_what_it_wrote(tmp_path):
+    write_result(tmp_path / "results", record("good", "Multi_Models_1"))
+    done = run_script("--results", tmp_path / "results", "--output", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [str(tmp_path / "out" / "LEADERBOARD.md")]
+
+
+# Figures ------------------------------------------------------------------------------------
+
+
+def test_a_method_keeps_its_colour_whoever_else_is_there():
+    order = ("imitation-flow", "linear", "gmr")
+    alone = method_styles({"gmr": ("GMR", "none")}, order)
+    both = method_styles({"gmr": ("GMR", "none"), "linear": ("Linear", "proved")}, order)
+    assert alone["gmr"] == both["gmr"]
+    assert both["gmr"].colour == PALETTE[2]
+    assert (both["gmr"].marker, both["linear"].marker) == ("X", "o")
+
+
+def test_labels_of_a_scatter_do_not_overlap():
+    """Eight methods, four of them nearly in one place."""
+    names = [f"method {i}" for i in range(8)]
+    styles = method_styles({name: (name, "proved") for name in names})
+    points = [Point(n, 1 + 0.01 * i if i < 4 else i, 100.0) for i, n in enumerate(names)]
+    figure = scatter_figure(points, styles, x_label="x", y_label="y")
+    (ax,) = figure.axes
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    texts = [text for text in ax.texts if text.get_text() in names]
+    assert sorted(text.get_text() for text in texts) == names
+    renderer = canvas.get_renderer()
+    boxes = [Text.get_window_extent(text, renderer) for text in texts]  # without lines to points
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[i + 1 :])
+
+
+def test_scores_that_cannot_be_drawn_are_counted():
+    styles = method_styles({"a": ("A", "none")})
+    figure = box_figure({"RMSE": {"a": [1.0, 2.0, np.inf, np.nan]}}, styles)
+    (ax,) = figure.axes
+    assert [text.get_text() for text in ax.texts] == ["+ 2 not finite or failed"]
+
+
+def test_a_method_without_a_finite_score_has_no_point():
+    styles = method_styles({"a": ("A", "none"), "b": ("B", "none")})
+    points = [Point("a", np.inf, 1.0), Point("b", 1.0, 2.0)]
+    figure = scatter_figure(points, styles, x_label="x", y_label="y")
+    assert [text.get_text() for text in figure.axes[0].texts] == ["B"]
+
+
+def test_rare_colours_survive_in_a_png(tmp_path):
+    """A median cut alone turns the few yellow pixels of a goal's star orange."""
+    from PIL import Image
+
+    noise = np.random.default_rng(0).uniform(1, 100, size=4000)
+    styles = method_styles({"a": ("A", "none")})
+    figure = box_figure({"RMSE": {"a": noise}}, styles)
+    figure.axes[0].plot([50.0], [0.0], "*", color=GOAL, markersize=15, zorder=9)
+    with Image.open(save_figure(figure, tmp_path / "figure.png")) as image:
+        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
+    wanted = [int(GOAL[i : i + 2], 16) for i in (1, 3, 5)]
+    assert (pixels == wanted).all(axis=1).sum() > 20
+
+
+def test_other_files_than_pictures_are_refused(tmp_path):
+    figure = box_figure({"RMSE": {"a": [1.0, 2.0]}}, method_styles({"a": ("A", "none")}))
+    with pytest.raises(ValueError, match=r"ends in \.svg or \.png"):
+        save_figure(figure, tmp_path / "figure.pdf")
