@@ -123,11 +123,14 @@ class ReplayPolicy:
             raise ValueError("Expected an environment to play in: call for_environment(env).")
         observations = np.asarray(observation, dtype=np.float64)
         x = np.atleast_2d(observations)[:, : self._recordings.n_dims]
+        dt = np.broadcast_to(self._env.dt, len(x))
         if state is None:
             distances = np.linalg.norm(x[:, None] - self._recordings.starts, axis=-1)
-            state = (distances.argmin(axis=1), 0)
+            # Two recordings may begin in one place; the episode's dt then tells which is meant.
+            nearest = distances <= distances.min(axis=1, keepdims=True) + 1e-12
+            mismatch = np.abs(dt[:, None] - np.array(self._recordings.dt))
+            state = (np.where(nearest, mismatch, np.inf).argmin(axis=1), 0)
         played, step = state
-        dt = np.broadcast_to(self._env.dt, len(x))
         targets = np.stack(
             [self._at(int(i), (step + 1) * h) for i, h in zip(played, dt, strict=True)]
         )

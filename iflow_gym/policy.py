@@ -117,8 +117,8 @@ class DynamicalSystemPolicy:
         self, x: FloatArray, dt: FloatArray, moves: FloatArray, limits: FloatArray
     ) -> FloatArray:
         """Return displacements along the orbits through x that keep the limits, shape (n, d)."""
-        # The fraction of a straight step, which is all that an explicit Euler step needs; just below
-        # it, so that rounding does not carry it over the limit.
+        # First the fraction of a straight step, which is all that an explicit Euler step needs;
+        # a little below it, so that rounding does not carry it over the limit.
         slow, fast = np.zeros(len(x)), np.ones(len(x))
         middle = (1 - 1e-12) * limits / _largest(moves)
         best = moves.copy()

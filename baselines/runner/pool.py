@@ -7,6 +7,7 @@ import json
 import os
 import re
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
@@ -126,7 +127,8 @@ class Pool:
                 for event in self._follow(journal, futures):
                     self._on_event(event)
             finally:
-                executor.shutdown(wait=True, kill_workers=True)
+                with _quiet_manager():
+                    executor.shutdown(wait=True, kill_workers=True)
         errors = [error for future in futures if (error := future.exception()) is not None]
         if not errors:
             return [], [], ""
@@ -177,6 +179,22 @@ class Pool:
             if path.name.split(".")[-2] in {str(pid) for pid in self._pids}:
                 with contextlib.suppress(OSError):
                     path.unlink()
+
+
+@contextlib.contextmanager
+def _quiet_manager() -> Iterator[None]:
+    """Hide the KeyError of loky's manager thread when its work items go while it hands them out."""
+    reported = threading.excepthook
+
+    def hook(args: threading.ExceptHookArgs) -> None:
+        if not issubclass(args.exc_type, KeyError):
+            reported(args)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = reported
 
 
 def _how_it_died(error: BaseException) -> str:

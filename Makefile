@@ -1,0 +1,45 @@
+# `make leaderboard` and `make test` do all their own set-up: a virtual environment, the install,
+# the work. PYTHON names the interpreter (3.11 to 3.13); JOBS the processes.
+PYTHON ?= python3
+VENV ?= .venv
+PRESET ?= standard
+JOBS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: leaderboard smoke test lint wheel clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make leaderboard   fit the baselines on LASA, score them, write leaderboard/LEADERBOARD.md"
+	@echo "                   (PRESET=smoke|standard|full, default standard: a quarter of an hour)"
+	@echo "make test          run the tests, the linter and the type checker"
+	@echo "make wheel         build the wheel, install it into an empty environment, try it there"
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "Installing into $(VENV) ..."
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test,dev]'
+	@touch $@
+
+leaderboard: $(STAMP)
+	$(BIN)/python baselines/run_all.py --preset $(PRESET) --jobs $(JOBS)
+	$(BIN)/python leaderboard/build.py
+
+smoke: $(STAMP)
+	$(BIN)/python baselines/run_all.py --preset smoke --jobs $(JOBS) --output results/smoke
+	$(BIN)/python leaderboard/build.py --results results/smoke --output results/smoke-board
+
+test: lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet --numprocesses 2
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+wheel: $(STAMP)
+	VENV=$(VENV) PYTHON=$(PYTHON) tests/wheel.sh
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info results

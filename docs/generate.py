@@ -1,0 +1,94 @@
+"""Writes the pages that are made of code: `python docs/generate.py`.
+
+docs/environments.md from the environments' docstrings, docs/metrics.md from the registry of
+metrics. A test compares the pages with what this would write.
+"""
+
+import inspect
+from pathlib import Path
+
+from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
+from iflow_gym.envs.lasa import LASAEnv
+from iflow_gym.envs.point_mass import PointMassEnv
+from iflow_gym.metrics import METRICS
+from iflow_gym.registration import POINT_MASS_ID, lasa_id
+
+DOCS = Path(__file__).parent
+
+
+def environments() -> str:
+    """Return the page of the environments."""
+    ids = "\n".join(f"- `{lasa_id(shape)}`" for shape in (*SINGLE_MOTIONS, *MULTI_MODELS))
+    return f"""# Environments
+
+![A frame: stream lines of a policy, the recordings, the mass](images/environment.png)
+
+*`gym.make("iflow/LASA-Sshape-v0", policy=system, render_mode="rgb_array")`: the stream lines of
+`system`, brighter where it is faster, the recordings, and the mass on its way.*
+
+`import iflow_gym` registers the environments. `"iflow_gym:iflow/LASA-Angle-v0"` imports it by
+itself, in another process for instance. Rendering needs no OpenGL.
+
+The batched version steps all at once in NumPy and gives the bits that the single one gives:
+`gym.make_vec(id, num_envs=1024, vectorization_mode="vector_entry_point")`.
+
+# `{POINT_MASS_ID}`: your own recordings
+
+`gym.make("{POINT_MASS_ID}", demonstrations=Demonstrations.from_arrays(...))`
+
+{inspect.getdoc(PointMassEnv)}
+
+# `iflow/LASA-<Shape>-v0`
+
+{inspect.getdoc(LASAEnv)}
+
+## Ids
+
+{ids}
+"""
+
+
+def metrics() -> str:
+    """Return the page of the metrics."""
+    tables = ""
+    for family in ("accuracy", "stability", "cost"):
+        rows = "\n".join(
+            f"| `{m.name}` | {m.definition} | {m.unit} | {m.better} |"
+            for m in METRICS
+            if m.family == family
+        )
+        tables += f"""
+## {family.capitalize()}
+
+| name | definition | unit | better |
+| --- | --- | --- | --- |
+{rows}
+"""
+    return f"""# Metrics
+
+Every metric is a pure function of arrays in `iflow_gym.metrics`, whose docstring has its equation,
+its source and what happens at the edges. Every result record carries a hash of their code.
+
+The environment is the judge: trajectories are recorded from the environment while it is stepped
+with a policy's commands, each held for one dt; a system's own integration is never scored.
+
+**Protocols.** `reproduction` fits on all recordings and rolls out from each one's start.
+`generalisation` fits on the first four of LASA's seven and scores the other three. A rollout has
+its recording's start, dt and number of samples.
+
+**Guarantees.** `proved`: by construction, for every state. `verified`: checked on a bounded region
+with an error bound. `sampled`: seen to hold where it was tried. `none`. Each method states its own,
+with the reason.
+
+**Aggregates** are interquartile means and means over environments and seeds with 95 % stratified
+bootstrap intervals (10 000 resamples): seeds are resampled within each environment; with one seed
+the environments are, and the table says so. A cell that failed is never dropped: it ranks last, and
+an aggregate without it says n of N.
+{tables}"""
+
+
+PAGES = {"environments.md": environments, "metrics.md": metrics}
+
+if __name__ == "__main__":
+    for name, page in PAGES.items():
+        (DOCS / name).write_text(page())

@@ -1,0 +1,77 @@
+"""Makes the pictures of the documentation: `python docs/pictures.py`, a minute and a half.
+
+docs/images/bend.png         the README's: one latent system, bent into three motions
+docs/images/environment.png  a frame of an environment, with a policy's stream lines
+"""
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import iflow_gym  # registers the environments
+from iflow_gym.baselines.imitation_flow import ImitationFlow
+from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.metrics import enlarged_box
+from iflow_gym.plotting import (
+    plot_demonstrations,
+    plot_goal,
+    plot_rollouts,
+    plot_streamlines,
+)
+
+IMAGES = Path(__file__).parent / "images"
+SHAPES = ("Sshape", "GShape", "Sharpc")
+
+
+def bend() -> None:
+    """Draw the latent system and what the flow makes of it, with paths from beside the data."""
+    motions = [load_lasa(shape) for shape in SHAPES]
+    systems = ImitationFlow().fit_many(motions, seeds=[0] * len(SHAPES))
+    figure = Figure(figsize=(14, 3.9), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(SHAPES) + 1)
+    latent = systems[0]._latent
+    corner = np.array([1.5, 1.5])
+    plot_streamlines(axes[0], lambda z: z @ latent.drift.T, -corner, corner)
+    axes[0].plot(0, 0, "o", color="black", markersize=7)
+    axes[0].set_title("latent: dz = A z dt + K dB, stable for every A we allow")
+    axes[0].title.set_fontsize(10)
+    for ax, motion, system in zip(axes[1:], motions, systems, strict=True):
+        low, high = enlarged_box(*motion.bounding_box, 1.5)
+        plot_streamlines(ax, system.velocity, low, high)
+        plot_demonstrations(ax, motion)
+        starts = np.random.default_rng(4).uniform(low, high, size=(10, 2))
+        plot_rollouts(ax, list(system.rollout(starts, 2000, motion.mean_dt)))
+        plot_goal(ax, motion.attractor)
+        ax.set_title(f"{motion.name}: y = h(z)", fontsize=10)
+    for ax in axes:
+        ax.set_xticks([])
+        ax.set_yticks([])
+        ax.set_aspect("equal")
+    figure.savefig(IMAGES / "bend.png")
+
+
+def environment() -> None:
+    """Draw a frame of the environment half way through an episode."""
+    motion = load_lasa("Sshape")
+    system = ImitationFlow(n_steps=600).fit(motion, seed=0)
+    env = gym.make("iflow/LASA-Sshape-v0", policy=system, render_mode="rgb_array")
+    policy = iflow_gym.DynamicalSystemPolicy(system, env)
+    observation, _ = env.reset(seed=0, options={"start": [-6.0, 20.0]})
+    for _ in range(600):
+        action, _ = policy.predict(observation)
+        observation, *_ = env.step(action)
+    frame = env.render()
+    figure = Figure(figsize=(frame.shape[1] / 100, frame.shape[0] / 100), dpi=100)
+    FigureCanvasAgg(figure)
+    figure.figimage(frame)
+    figure.savefig(IMAGES / "environment.png")
+
+
+if __name__ == "__main__":
+    IMAGES.mkdir(exist_ok=True)
+    environment()
+    bend()

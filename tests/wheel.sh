@@ -1,0 +1,18 @@
+#!/usr/bin/env bash
+# Build the wheel, install it into an empty environment, and run the README's first snippet there
+# from a neutral folder: what a user of `pip install` gets, without this checkout in sight.
+set -euo pipefail
+here=$(cd "$(dirname "$0")/.." && pwd)
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+"$here/${VENV:-.venv}/bin/python" -m build --quiet --wheel --outdir "$work/dist" "$here"
+if unzip -l "$work"/dist/*.whl 2>/dev/null | grep -qE '\.mat$'; then
+    echo "The wheel carries LASA's data." >&2
+    exit 1
+fi
+"${PYTHON:-python3}" -m venv "$work/venv"
+"$work/venv/bin/python" -m pip install --quiet --constraint "$here/constraints.txt" "$work"/dist/*.whl
+"$here/${VENV:-.venv}/bin/python" "$here/tests/docs/snippets.py" "$here/README.md" 0 > "$work/snippet.py"
+cd "$work"
+"$work/venv/bin/python" snippet.py
+echo "The wheel works: $(basename "$work"/dist/*.whl)"
