@@ -1,9 +1,8 @@
 # `make leaderboard` and `make test` do all their own set-up: a virtual environment, the install,
-# the work. PYTHON names the interpreter (3.11 to 3.13); JOBS the processes.
+# the work. PYTHON names the interpreter (3.11 to 3.13); JOBS the processes (one a core).
 PYTHON ?= python3
 VENV ?= .venv
 PRESET ?= standard
-JOBS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
@@ -23,11 +22,11 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 leaderboard: $(STAMP)
-	$(BIN)/python baselines/run_all.py --preset $(PRESET) --jobs $(JOBS)
+	$(BIN)/python baselines/run_all.py --preset $(PRESET) $(if $(JOBS),--jobs $(JOBS))
 	$(BIN)/python leaderboard/build.py
 
 smoke: $(STAMP)
-	$(BIN)/python baselines/run_all.py --preset smoke --jobs $(JOBS) --output results/smoke
+	$(BIN)/python baselines/run_all.py --preset smoke $(if $(JOBS),--jobs $(JOBS)) --output results/smoke
 	$(BIN)/python leaderboard/build.py --results results/smoke --output results/smoke-board
 
 test: lint

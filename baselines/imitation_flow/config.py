@@ -30,6 +30,8 @@ class ImitationFlowConfig:
     likelihood_fraction: float = 0.2
     """Share of the steps that maximise the likelihood before the reproduction error is minimised
     ("reproduction" only)."""
+    likelihood_weight: float = 0.1
+    """Weight of the likelihood while the reproduction error is minimised. 0 leaves it out."""
     learning_rate: float = 3e-3
     """Peak of the one-cycle learning rate."""
     max_gradient_norm: float = 1.0
@@ -70,5 +72,6 @@ class ImitationFlowConfig:
             raise ValueError(
                 f"Expected likelihood_fraction in [0, 1], got {self.likelihood_fraction}."
             )
-        if min(self.tube_weight, self.calm_weight) < 0:
-            raise ValueError("Expected tube_weight and calm_weight >= 0.")
+        for name in ("likelihood_weight", "tube_weight", "calm_weight"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"Expected {name} >= 0, got {getattr(self, name)}.")

@@ -13,9 +13,10 @@ objectives are those of `ImitationFlowConfig.objective`:
 "reproduction"
     First the forward conditional likelihood p(y_{i+k} | y_i) over horizons k, log-uniform up to
     60 % of the recording. Then the reproduction itself: from a recording's first sample
-    y^(t) = h(exp(A t) h^-1(y_0)) in closed form, squared error to y(t) at random times t. Two
-    penalties shape the field beside the data: the tube and the calm, see the configuration. Last,
-    with the flow and A fixed, the noise is fitted by the same likelihood.
+    y^(t) = h(exp(A t) h^-1(y_0)) in closed form, squared error to y(t) at random times t, with the
+    likelihood kept at a small weight. Two penalties shape the field beside the data: the tube and
+    the calm, see the configuration. Last, with the flow and A fixed, the noise is fitted by the
+    same likelihood.
 """
 
 from __future__ import annotations
@@ -192,6 +193,10 @@ def train(
             loss = _forward_likelihood(config, model, data, draws)
         else:
             loss = _reproduction(config, model, data, draws)
+            if config.likelihood_weight:
+                loss = loss + config.likelihood_weight * _forward_likelihood(
+                    config, model, data, draws
+                )
         if config.calm_weight and config.objective == "reproduction":
             loss = loss + config.calm_weight * _calm(config, model, data, draws)
         optimizer.zero_grad()
