@@ -3,10 +3,13 @@
 PYTHON ?= python3
 VENV ?= .venv
 PRESET ?= standard
+# The smoke preset's few steps are no scores: they stay out of the leaderboard.
+RESULTS := $(if $(filter smoke,$(PRESET)),results/smoke,leaderboard/results)
+BOARD := $(if $(filter smoke,$(PRESET)),results/smoke-board,leaderboard)
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: leaderboard smoke test lint wheel clean
+.PHONY: help leaderboard test lint wheel clean
 .DEFAULT_GOAL := help
 
 help:
@@ -21,13 +24,13 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test,dev]'
 	@touch $@
 
+# A failed cell has its place on the board, so the board is built then, too.
 leaderboard: $(STAMP)
-	$(BIN)/python baselines/run_all.py --preset $(PRESET) $(if $(JOBS),--jobs $(JOBS))
-	$(BIN)/python leaderboard/build.py
-
-smoke: $(STAMP)
-	$(BIN)/python baselines/run_all.py --preset smoke $(if $(JOBS),--jobs $(JOBS)) --output results/smoke
-	$(BIN)/python leaderboard/build.py --results results/smoke --output results/smoke-board
+	@status=0; \
+	$(BIN)/python baselines/run_all.py --preset $(PRESET) $(if $(JOBS),--jobs $(JOBS)) \
+	    --output $(RESULTS) || status=$$?; \
+	if [ $$status -gt 1 ]; then exit $$status; fi; \
+	$(BIN)/python leaderboard/build.py --results $(RESULTS) --output $(BOARD) && exit $$status
 
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet --numprocesses 2

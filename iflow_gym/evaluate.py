@@ -23,10 +23,10 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from iflow_gym import metrics
-from iflow_gym.demonstrations import Demonstrations, FloatArray
+from iflow_gym.demonstrations import BoundingBox, Demonstrations, FloatArray
 from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
-from iflow_gym.envs.task import PointMassInterface, Push
-from iflow_gym.metrics.stability import STARTS_PER_AXIS
+from iflow_gym.envs.task import THINNEST_SIDE, PointMassInterface, Push
+from iflow_gym.metrics.stability import PERTURBATION_SIZE, PERTURBATION_TIME, STARTS_PER_AXIS
 from iflow_gym.policy import DynamicalSystemPolicy
 from iflow_gym.system import DynamicalSystem
 
@@ -38,6 +38,9 @@ STARTS = 256
 
 TIMED_CALLS = 300
 """Calls of the policy that `step_us` is the median of."""
+
+NUDGE = 1e-6
+"""How far a state is moved along the field to see V change, as a fraction of the diagonal."""
 
 FIT_COSTS = ("fit_seconds", "fit_cpu_seconds", "peak_memory_mb")
 """Metrics that only whoever fits can measure."""
@@ -143,6 +146,8 @@ def evaluate(
     per_demonstration = _accuracy(policy, task, scored, indices)
     if system is not None:
         per_demonstration |= _teacher_forced(system, scored)
+        if protocol == "generalisation":  # elsewhere nothing is held out
+            per_demonstration |= _likelihood(system, scored)
     values: Scores = {m.name: None for m in metrics.METRICS if m.name not in FIT_COSTS}
     if stability:
         pushes = push_rng.integers(2**31, size=len(demos))[indices].tolist()
@@ -324,14 +329,19 @@ def trajectory_scores(
 def _teacher_forced(
     system: DynamicalSystem, scored: Demonstrations
 ) -> dict[str, list[float | None]]:
-    """Return the scores of the field, and of the density, at the demonstrations' own samples."""
+    """Return the scores of the field at the demonstrations' own samples."""
     predicted = [system.velocity(p) for p in scored.positions]
     functions: dict[str, Callable[[Any, Any], Any]] = {
         "seds_error": metrics.seds_error,
         "direction_error": metrics.direction_error,
         "velocity_rmse": metrics.velocity_rmse,
     }
-    found = {name: _each(f, scored.velocities, predicted) for name, f in functions.items()}
+    return {name: _each(f, scored.velocities, predicted) for name, f in functions.items()}
+
+
+def _likelihood(system: DynamicalSystem, scored: Demonstrations) -> dict[str, list[float | None]]:
+    """Return the negative log-likelihood of the demonstrations' transitions, where there is one."""
+    found: dict[str, list[float | None]] = {}
     for k in TRANSITIONS:
         values = [_nll(system, p, k, h) for p, h in zip(scored.positions, scored.dt, strict=True)]
         if any(value is not None for value in values):
@@ -364,13 +374,13 @@ def _stability(
 ) -> tuple[Scores, list[float | None]]:
     """Return the scores of rollouts from the grid, and whether each pushed one converged."""
     demos = task.demonstrations
-    low, high = demos.bounding_box
+    low, high = _scored_box(demos)
     goal, d = demos.attractor, demos.n_dims
     per_axis = None if d in STARTS_PER_AXIS else max(2, round(STARTS ** (1 / d)))
     grid = metrics.start_grid(low, high, per_axis)
     n_steps = math.ceil(metrics.HORIZON * float(demos.durations.max()) / demos.mean_dt)
     free = _vector(task, len(grid), n_steps)
-    pushed = _vector(task, len(indices), n_steps, Push())
+    pushed = _vector(task, len(indices), n_steps, Push(PERTURBATION_TIME, PERTURBATION_SIZE))
     from_grid, _ = free.reset(seed=0, options={"start": grid})
     from_starts, _ = pushed.reset(
         seed=list(push_seeds), options={"demonstration": np.array(indices)}
@@ -380,13 +390,17 @@ def _stability(
     free_paths, pushed_paths = paths[: len(grid)], paths[len(grid) :]
     tolerance = metrics.convergence_tolerance(low, high)
     duration = float(demos.durations.mean())
+    gone = metrics.diverged(free_paths, low, high)
     found: Scores = {
         "converged": metrics.fraction(metrics.converged(free_paths, goal, tolerance)),
         "settling_time": metrics.settling_time(
             free_paths, goal, tolerance, demos.mean_dt, duration
         ),
-        "spurious_attractors": float(metrics.spurious_attractors(free_paths, goal, tolerance)),
-        "diverged": metrics.fraction(metrics.diverged(free_paths, low, high)),
+        # A rollout that leaves ends at the environment's wall, which is no attractor of the method.
+        "spurious_attractors": float(
+            metrics.spurious_attractors(free_paths[~gone], goal, tolerance) if not gone.all() else 0
+        ),
+        "diverged": metrics.fraction(gone),
     }
     recovered = metrics.converged(pushed_paths, goal, tolerance)
     return found, [float(r) for r in recovered]
@@ -395,9 +409,34 @@ def _stability(
 def _lyapunov_violation(
     system: DynamicalSystem, demos: Demonstrations, rng: np.random.Generator
 ) -> float | None:
-    states = metrics.uniform_states(*demos.bounding_box, rng=rng)
-    rates = system.lyapunov_rate(states)
-    return None if rates is None else metrics.lyapunov_violation(rates, states, demos.attractor)
+    """Return where V does not decrease along the field.
+
+    dV/dt is the central difference of `lyapunov` along `velocity`, over a way of `NUDGE` diagonals
+    each: a method is not asked for its own opinion of its derivative.
+    """
+    low, high = _scored_box(demos)
+    states = metrics.uniform_states(low, high, rng=rng)
+    if system.lyapunov(states[:1]) is None:
+        return None
+    field = system.velocity(states)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a field of 0 or nan is a violation
+        nudge = field * (
+            NUDGE * metrics.box_diagonal(low, high) / np.linalg.norm(field, axis=1, keepdims=True)
+        )
+        ahead, behind = system.lyapunov(states + nudge), system.lyapunov(states - nudge)
+        rates = np.asarray(ahead) - np.asarray(behind)
+    return metrics.lyapunov_violation(rates, states, demos.attractor)
+
+
+def _scored_box(demos: Demonstrations) -> BoundingBox:
+    """Return the box that starts are taken from: the bounding box, where each side has a length.
+
+    A side without one, as a straight line along an axis has, is given `THINNEST_SIDE` diagonals,
+    as the environment gives it in its arena.
+    """
+    box = demos.bounding_box
+    missing = 0.5 * THINNEST_SIDE * box.diagonal * (box.high == box.low)
+    return BoundingBox(box.low - missing, box.high + missing)
 
 
 # Cost -------------------------------------------------------------------------------------

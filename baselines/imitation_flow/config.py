@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -66,12 +67,12 @@ class ImitationFlowConfig:
             "log_scale_bound", "sharpness", "learning_rate", "max_gradient_norm", "min_decay",
             "calm_speed", "tube_width",
         ):  # fmt: skip
-            if not getattr(self, name) > 0:
-                raise ValueError(f"Expected {name} > 0, got {getattr(self, name)}.")
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"Expected a finite {name} > 0, got {getattr(self, name)}.")
         if not 0 <= self.likelihood_fraction <= 1:
             raise ValueError(
                 f"Expected likelihood_fraction in [0, 1], got {self.likelihood_fraction}."
             )
         for name in ("likelihood_weight", "tube_weight", "calm_weight"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"Expected {name} >= 0, got {getattr(self, name)}.")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"Expected a finite {name} >= 0, got {getattr(self, name)}.")

@@ -49,6 +49,9 @@ WARM_UP = 0.15
 SQUARED_ERROR_WEIGHT = 100.0
 """Weight of the squared error, against which the penalties are measured."""
 
+MOST_DROPPED = 0.01
+"""Steps whose gradient is not finite are left out; more than this share of them is no fit."""
+
 CALM_POINTS = 32
 CALM_STEP = 0.02
 """The calm penalty sees the mean speed over this fraction of the duration, from so many states."""
@@ -185,6 +188,7 @@ def train(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, config.learning_rate, total_steps=config.n_steps, pct_start=WARM_UP
     )
+    dropped = torch.zeros(data.n_models, device=device)
     n_likelihood = round(config.likelihood_fraction * config.n_steps)
     for step in range(config.n_steps):
         if config.objective == "paper":
@@ -201,17 +205,18 @@ def train(
             loss = loss + config.calm_weight * _calm(config, model, data, draws)
         optimizer.zero_grad()
         loss.sum().backward()
-        _clip_gradients(model, config.max_gradient_norm)
+        dropped += ~_clip_gradients(model, config.max_gradient_norm)
         optimizer.step()
         schedule.step()
     if config.objective == "reproduction":
         _fit_noise(model, data, draws)
     model = model.to("cpu")
-    for motion, finite in zip(motions, _finite(model).tolist(), strict=True):
-        if not finite:
+    lost = (dropped / config.n_steps).tolist()
+    for motion, finite, share in zip(motions, _finite(model).tolist(), lost, strict=True):
+        if not finite or share > MOST_DROPPED:
             raise TrainingError(
-                f"ImitationFlow did not converge on {motion.name!r}: parameters are not finite. "
-                f"Lower learning_rate (now {config.learning_rate})."
+                f"ImitationFlow did not converge on {motion.name!r}: {share:.0%} of its gradients "
+                f"were not finite. Lower learning_rate (now {config.learning_rate}) or the weights."
             )
     return model
 
@@ -347,8 +352,11 @@ def _fit_noise(model: BatchedModel, data: _Recordings, draws: _Draws) -> None:
         optimizer.step()
 
 
-def _clip_gradients(model: BatchedModel, max_norm: float) -> None:
-    """Scale each model's gradient to `max_norm` at most; drop a gradient that is not finite."""
+def _clip_gradients(model: BatchedModel, max_norm: float) -> Tensor:
+    """Scale each model's gradient to `max_norm` at most; drop one that is not finite.
+
+    Returns which models' gradients were finite, shape (m,).
+    """
     gradients = [(p.grad, axis) for p, axis in model.parameters_by_model() if p.grad is not None]
     norm = torch.stack([_over_models(g.square(), axis) for g, axis in gradients]).sum(0).sqrt()
     finite = norm.isfinite()
@@ -357,6 +365,7 @@ def _clip_gradients(model: BatchedModel, max_norm: float) -> None:
         shape = [1] * gradient.dim()
         shape[axis] = -1
         gradient.masked_fill_(~finite.view(shape), 0.0).mul_(factor.view(shape))
+    return finite
 
 
 def _over_models(values: Tensor, axis: int) -> Tensor:

@@ -106,7 +106,7 @@ METRICS: tuple[Metric, ...] = (
         "accuracy",
         "NLL, 1 step",
         "Mean negative log-likelihood of held-out transitions over 1 sample, per dimension; null "
-        "for methods without a density.",
+        "for methods without a density, and in reproduction, where nothing is held out.",
     ),
     Metric(
         "nll_10",
@@ -115,7 +115,7 @@ METRICS: tuple[Metric, ...] = (
         "accuracy",
         "NLL, 10 steps",
         "Mean negative log-likelihood of held-out transitions over 10 samples, per dimension; null "
-        "for methods without a density.",
+        "for methods without a density, and in reproduction, where nothing is held out.",
     ),
     Metric(
         "converged",

@@ -290,7 +290,8 @@ def spurious_attractors(trajectories: ArrayLike, goal: ArrayLike, tolerance: flo
 
     Notes
     -----
-    A state that is held at the bounds of its environment has stopped, and counts.
+    A state that is held at the bounds of its environment has stopped, and counts: leave out the
+    rollouts that `diverged`.
     """
     rollouts = as_rollouts(trajectories)
     tolerance = positive(tolerance, "tolerance")
@@ -339,62 +340,6 @@ def diverged(trajectories: ArrayLike, low: ArrayLike, high: ArrayLike) -> BoolAr
     as_point(lower, rollouts.shape[-1], "low")
     inside = (rollouts >= lower) & (rollouts <= upper)  # nan compares false
     return ~np.asarray(inside.all(axis=(1, 2)))
-
-
-def perturbation_step(n_samples: int) -> int:
-    """Sample of the rollout at which the push of `perturbation_recovery` is added to the state.
-
-    Parameters
-    ----------
-    n_samples
-        Number of samples of the demonstration, T_n: 40 % of the way is 40 % of its time.
-
-    Returns
-    -------
-    int
-        floor(0.4 T_n).
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than 3 samples: the push would come at the start.
-    """
-    if n_samples < 3:
-        raise ValueError(f"Expected a demonstration of at least 3 samples, got {n_samples}")
-    return int(np.floor(PERTURBATION_TIME * n_samples))
-
-
-def perturbation_displacements(
-    n: int, d: int, diagonal: float, rng: np.random.Generator
-) -> FloatArray:
-    """Pushes of `perturbation_recovery`: 25 % of the diagonal, in directions uniform on the sphere.
-
-    Parameters
-    ----------
-    n
-        Number of pushes: one a demonstration.
-    d
-        Dimension of the positions.
-    diagonal
-        Length of the box's diagonal, in units of length.
-    rng
-        Source of the directions: the same seed gives every method the same pushes.
-
-    Returns
-    -------
-    array of shape (n, d)
-        Displacements, in units of length.
-
-    Raises
-    ------
-    ValueError
-        If n or d is below 1, or the diagonal is not positive.
-    """
-    if n < 1 or d < 1:
-        raise ValueError(f"Expected n >= 1 and d >= 1, got n={n} and d={d}")
-    directions = rng.standard_normal((n, d))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return PERTURBATION_SIZE * positive(diagonal, "diagonal") * directions
 
 
 def uniform_states(

@@ -228,34 +228,6 @@ class TestDiverged:
             metrics.diverged(np.zeros((1, 5, 3)), LOW, HIGH)
 
 
-class TestPerturbation:
-    @pytest.mark.parametrize("d", [1, 2, 3])
-    def test_length_and_seed(self, d):
-        pushes = metrics.perturbation_displacements(500, d, 80.0, np.random.default_rng(0))
-        assert pushes.shape == (500, d)
-        np.testing.assert_allclose(np.linalg.norm(pushes, axis=1), 20.0)
-        again = metrics.perturbation_displacements(500, d, 80.0, np.random.default_rng(0))
-        np.testing.assert_array_equal(pushes, again)
-        # Uniform on the sphere: each coordinate has mean 0 and variance 20²/d; 5 standard errors.
-        assert np.abs(pushes.mean(axis=0)).max() < 5 * 20 / np.sqrt(d * 500)
-
-    def test_time(self):
-        assert metrics.perturbation_step(1000) == 400
-        assert metrics.perturbation_step(3) == 1
-        assert [metrics.perturbation_step(5 * n) for n in range(1, 400)] == [
-            2 * n for n in range(1, 400)
-        ]
-
-    def test_errors(self):
-        rng = np.random.default_rng(0)
-        with pytest.raises(ValueError, match="n >= 1 and d >= 1, got n=0 and d=2"):
-            metrics.perturbation_displacements(0, 2, 1.0, rng)
-        with pytest.raises(ValueError, match="finite diagonal > 0"):
-            metrics.perturbation_displacements(1, 2, 0.0, rng)
-        with pytest.raises(ValueError, match="at least 3 samples, got 2"):
-            metrics.perturbation_step(2)
-
-
 class TestLyapunov:
     def test_states_fill_the_enlarged_box(self):
         states = metrics.uniform_states(LOW, HIGH, rng=np.random.default_rng(0))
