@@ -28,7 +28,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.system import DynamicalSystem, Guarantee
+from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
 
 MOST_COMPONENTS = 10
 LEAST_COMPONENTS = 2
@@ -39,6 +39,10 @@ SAMPLES_PER_COMPONENT = 8
 FAR = 1e8
 """Farther than this from the goal, in the farthest component's distance, the weights are those of
 the same direction at this distance, where they have long settled; their squares would overflow."""
+
+
+PRIORS_TOLERANCE = 1e-6
+"""How far from 1 a file's priors may sum."""
 
 
 @dataclass(frozen=True)
@@ -331,13 +335,16 @@ class GMR(DynamicalSystem):
         return {"priors": self.priors_, "means": self.means_, "covariances": self.covariances_}
 
     def _restore(self, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        priors, means, covariances = (arrays[k] for k in ("priors", "means", "covariances"))
-        n, size = len(priors), 2 * self.n_dims_
-        came = (priors.shape, means.shape, covariances.shape)
-        if came != ((n,), (n, size), (n, size, size)):
-            raise ValueError(f"expected priors, means and covariances of a mixture, got {came}")
-        if not (priors > 0).all():
-            raise ValueError("expected priors > 0")
-        if np.linalg.eigvalsh(covariances).min() <= 0:
-            raise ValueError("expected covariances that are positive definite")
+        names = ("priors", "means", "covariances")
+        priors, means, covariances = (np.asarray(arrays[k], dtype=np.float64) for k in names)
+        n, size = priors.size, 2 * self.n_dims_
+        expected = [(n,), (n, size), (n, size, size)]
+        came = [a.shape for a in (priors, means, covariances)]
+        if n < 1 or came != expected:
+            raise ValueError(
+                f"expected {', '.join(names)} of shapes {expected} with n >= 1, got {came}"
+            )
+        if not ((priors > 0).all() and abs(priors.sum() - 1) <= PRIORS_TOLERANCE):
+            raise ValueError(f"expected priors > 0 that sum to 1, got {priors}")
+        check_positive_definite(covariances, "covariance")
         self._adopt(priors, means, covariances, self.goal_)

@@ -6,7 +6,13 @@ failed is tried again. Ctrl-C keeps what is done.
 
     python baselines/run_all.py --preset smoke
     python baselines/run_all.py --methods 'imitation-*' linear --envs 'LASA-Sharp*' --jobs 2
-    python baselines/run_all.py --methods my_package.module:MyMethod
+
+From any folder, with a method of one's own, also where iflow_gym is installed without its checkout:
+
+    python -m iflow_gym.baselines.run_all --methods my_module:MyMethod --output results
+
+Methods that fit several motions together do so in batches of the selected environments, and scores
+depend a little on the batch: another selection of environments is another batch, hence a new run.
 
 Exit status: 0 when every cell has scores, 1 when one failed, 2 for a name or a preset that is not
 understood, 130 after Ctrl-C.
@@ -97,7 +103,7 @@ def run_all(options: RunOptions, console: Console) -> int:
             f"{len(cells)} cells, {len(cells) - len(to_do)} up to date, {len(to_do)} to do by "
             f"{min(jobs, max(len(to_do), 1))} workers, into {folder}"
         )
-        Pool(folder, jobs, reporter.event).run(plan.make_jobs(to_do, jobs))
+        Pool(folder, jobs, reporter.event).run(plan.make_jobs(cells, to_do))
     results = [read_result(folder / cell.path) for cell in cells]
     console.print(summary(results))
     failed = [result for result in results if not result.ok]
@@ -105,7 +111,7 @@ def run_all(options: RunOptions, console: Console) -> int:
         reporter.line(f"FAILED {result.path}: {(result.reason or '').splitlines()[0]}")
     reporter.line(
         f"{len(to_do)} cells in {time.monotonic() - began:.0f} s, {len(failed)} failed. "
-        "Now build the tables: python leaderboard/build.py"
+        f"Now build the tables: python leaderboard/build.py --results {folder} --output <folder>"
     )
     return 1 if failed else 0
 

@@ -1,17 +1,22 @@
 """Writes the pages that are made of code: `python docs/generate.py`.
 
 docs/environments.md from the environments' docstrings, docs/metrics.md from the registry of
-metrics. A test compares the pages with what this would write.
+metrics, the README's table of results from the committed records. A test compares the pages with
+what this would write.
 """
 
 import inspect
 from pathlib import Path
 
+import numpy as np
+
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
+from iflow_gym.demonstrations import PROTOCOLS
 from iflow_gym.envs.lasa import LASAEnv
 from iflow_gym.envs.point_mass import PointMassEnv
 from iflow_gym.metrics import METRICS
 from iflow_gym.registration import POINT_MASS_ID, lasa_id
+from iflow_gym.results import read_results
 
 DOCS = Path(__file__).parent
 
@@ -87,7 +92,52 @@ an aggregate without it says n of N.
 {tables}"""
 
 
-PAGES = {"environments.md": environments, "metrics.md": metrics}
+def results() -> str:
+    """Return the README's table: means over LASA-26 of the committed records."""
+    records = read_results(DOCS.parent / "leaderboard" / "results")
+    columns = {
+        "rmse": "RMSE (mm)",
+        "frechet": "Fréchet (mm)",
+        "dtw": "DTW / sample (mm)",
+        "converged": "converged",
+        "fit_seconds": "fit (s a shape)",
+    }
+    text = ""
+    for protocol in PROTOCOLS:
+        rows = []
+        for method in dict.fromkeys(r.method for r in records):
+            of_method = [
+                r
+                for r in records
+                if (r.method, r.protocol, r.family) == (method, protocol, "LASA-26")
+            ]
+            good = [r for r in of_method if r.ok]
+            if not good or good[0].reference:
+                continue
+            values = [[r.metrics[name] for r in good] for name in columns]
+            means = [float(np.mean([v for v in column if v is not None])) for column in values]
+            kinds = {r.guarantee.kind for r in good if r.guarantee is not None}
+            cells = f"{len(good)} of {len(of_method)}"
+            shown = [f"{m:.3g}" for m in means]
+            shown[3] = f"{100 * means[3]:.3g} %"
+            line = " | ".join([good[0].title, ", ".join(sorted(kinds)), *shown, cells])
+            rows.append((means[1], f"| {line} |"))
+        head = " | ".join(["", "guarantee", *columns.values(), "cells"])
+        rule = " | ".join(["---"] * 2 + ["---:"] * (len(columns) + 1))
+        table = "\n".join(row for _, row in sorted(rows))
+        text += f"**{protocol.capitalize()}**\n\n|{head} |\n| {rule} |\n{table}\n\n"
+    return text.strip()
+
+
+def readme() -> str:
+    """Return the README with its table of results filled in."""
+    path = DOCS.parent / "README.md"
+    head, rest = path.read_text().split("<!-- results -->")
+    _, tail = rest.split("<!-- /results -->")
+    return f"{head}<!-- results -->\n{results()}\n<!-- /results -->{tail}"
+
+
+PAGES = {"environments.md": environments, "metrics.md": metrics, "../README.md": readme}
 
 if __name__ == "__main__":
     for name, page in PAGES.items():

@@ -26,12 +26,16 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from iflow_gym.demonstrations import PROTOCOLS
+from iflow_gym.metrics import METRICS
 from iflow_gym.system import Guarantee
 
 SCHEMA_VERSION = 1
 """Version of the result files that `write_result` writes."""
 
 Status = Literal["ok", "failed"]
+
+MAY_BE_NEGATIVE = "nll_"
+"""How the names of the metrics begin that can be negative: densities can exceed 1."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -73,6 +77,8 @@ class Result:
     """Value for each scored demonstration, in the order of the split."""
     guarantee: Guarantee | None = None
     """What the method says of its stability; None for a failed cell and for a reference."""
+    target: str | None = None
+    """``"module:Class"`` that was run, by which its model can be loaded."""
     config: dict[str, Any] = field(default_factory=dict)
     """The method's settings."""
     integrator: str | None = None
@@ -117,6 +123,24 @@ class Result:
 
 class ResultFileError(ValueError):
     """A file in a folder of results is not what it should be."""
+
+
+def check_metrics(metrics: Mapping[str, float | None]) -> None:
+    """Raise ValueError unless every metric has a number that it can have, or None.
+
+    A negative value is one that only a log-likelihood can have; nan is no value.
+    """
+    if missing := sorted({metric.name for metric in METRICS} - set(metrics)):
+        raise ValueError(f"expected every metric, got none of {missing}")
+    for name, value in metrics.items():
+        _check_value(name, value)
+
+
+def _check_value(name: str, value: float | None) -> None:
+    if value is not None and (
+        math.isnan(value) or (value < 0 and not name.startswith(MAY_BE_NEGATIVE))
+    ):
+        raise ValueError(f"expected {name} to be at least 0, infinite or null, got {value}")
 
 
 def short_name(environment: str) -> str:
@@ -168,12 +192,13 @@ def read_result(path: str | os.PathLike[str]) -> Result:
     FileNotFoundError
         If there is no such file.
     ResultFileError
-        If the file is cut off, is no result record, or is a newer version's.
+        If the file is cut off, is no result record, lacks a metric or has a value for one that
+        it cannot have, or is a newer version's.
     """
     file = Path(path)
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:  # of JSON and of UTF-8
+    except (ValueError, RecursionError) as error:  # of JSON, of UTF-8, of what is nested too deep
         raise ResultFileError(
             f"{file} is no whole JSON file ({error}): delete it and run its cell again."
         ) from error
@@ -194,7 +219,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
         )
     try:
         return _decoded(values)
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise ResultFileError(
             f"{file} is no valid result record ({error}): delete it and run its cell again."
         ) from error
@@ -259,7 +284,10 @@ def _encoded(value: Any) -> Any:
 
 
 def _number(value: Any) -> float | None:
-    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+    if value is None:
+        return None
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        float(value)  # raises for an integer of JSON that is too large for it
         return value
     if value in ("inf", "-inf"):
         return float(value)
@@ -275,6 +303,13 @@ def _decoded(values: dict[str, Any]) -> Result:
         key: [_number(value) for value in entries]
         for key, entries in values["per_demonstration"].items()
     }
+    if values["status"] == "ok":
+        check_metrics(numbers["metrics"])
+    for name, value in numbers["medians"].items():
+        _check_value(name, value)
+    for name, entries in lists.items():
+        for value in entries:
+            _check_value(name, value)
     guarantee = values["guarantee"]
     return Result(
         **{

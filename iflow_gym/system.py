@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import operator
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, SupportsIndex, get_args
 
 import numpy as np
 import safetensors
@@ -26,7 +27,12 @@ from iflow_gym.demonstrations import Demonstrations, FloatArray
 SCHEMA_VERSION = 1
 """Version of the model files that `DynamicalSystem.save` writes."""
 
-GuaranteeKind = Literal["proved", "verified", "sampled", "none"]
+SYMMETRIC = 1e-9
+"""How far a covariance may be from symmetric, with variances scaled to 1: rounding."""
+
+GuaranteeKind = Literal["none", "sampled", "verified", "proved"]
+GUARANTEE_KINDS: tuple[GuaranteeKind, ...] = get_args(GuaranteeKind)
+"""From the weakest to the strongest."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,12 @@ class Guarantee:
 
     kind: GuaranteeKind
     reason: str
+
+    def __post_init__(self) -> None:
+        if self.kind not in (kinds := GUARANTEE_KINDS):
+            raise ValueError(f"Expected a guarantee of kind {', '.join(kinds)}, got {self.kind!r}.")
+        if not (isinstance(self.reason, str) and self.reason.strip()):
+            raise ValueError(f"Expected the reason of the guarantee, got {self.reason!r}.")
 
 
 class NotFittedError(RuntimeError):
@@ -143,13 +155,16 @@ class DynamicalSystem(ABC):
     def step(self, x: ArrayLike, dt: float | FloatArray) -> FloatArray:
         """Return the states, shape (..., d), a time dt (seconds, > 0, broadcast) after x."""
         states, shape = self._states(x)
-        steps = np.broadcast_to(np.asarray(dt, dtype=np.float64), shape[:-1]).reshape(-1)
-        return self._step(states, steps).reshape(shape)
+        return self._step(states, _steps(dt, shape[:-1])).reshape(shape)
 
     def rollout(self, x0: ArrayLike, n_steps: int, dt: float) -> FloatArray:
-        """Return the trajectory from x0, shape (..., n_steps + 1, d), x0 (..., d) included."""
+        """Return the trajectory from x0, shape (..., n_steps + 1, d), x0 (..., d) included.
+
+        n_steps is a whole number >= 0, dt one time in seconds > 0.
+        """
         states, shape = self._states(x0)
-        path = self._rollout(states, int(n_steps), float(dt))
+        n_steps, dt = whole_number(n_steps), seconds(dt)
+        path = self._rollout(states, n_steps, dt)
         return path.reshape(*shape[:-1], n_steps + 1, shape[-1])
 
     def lyapunov(self, x: ArrayLike) -> FloatArray | None:
@@ -165,10 +180,15 @@ class DynamicalSystem(ABC):
         return None if value is None else value.reshape(shape[:-1])
 
     def log_prob(self, x: ArrayLike, x_next: ArrayLike, dt: float) -> FloatArray | None:
-        """Return log p(x_next | x, dt), shape (...); None for a method without a density."""
+        """Return log p(x_next | x, dt), shape (...); None for a method without a density.
+
+        x and x_next are of one shape, (..., d), dt is one time in seconds > 0.
+        """
         states, shape = self._states(x)
-        following, _ = self._states(x_next)
-        value = self._log_prob(states, following, float(dt))
+        following, shape_next = self._states(x_next)
+        if shape != shape_next:
+            raise ValueError(f"Expected x and x_next of one shape, got {shape} and {shape_next}.")
+        value = self._log_prob(states, following, seconds(dt))
         return None if value is None else value.reshape(shape[:-1])
 
     @abstractmethod
@@ -223,11 +243,16 @@ class DynamicalSystem(ABC):
 
     @abstractmethod
     def _arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Return the fitted parameters by name."""
+        """Return the fitted parameters by name, real floating and finite: what a file holds."""
 
     @abstractmethod
     def _restore(self, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the fitted parameters back; raise KeyError or ValueError if they do not fit."""
+        """Take the fitted parameters back; raise KeyError or ValueError if they do not fit.
+
+        `config`, `n_dims_` and `goal_` are set. A file may come from anywhere: the numbers that the
+        guarantee rests on are checked here. What `_arrays` returns afterwards are the names that a
+        file must have; other ones are refused.
+        """
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write a safetensors file whose header holds the settings as JSON; replace atomically."""
@@ -240,6 +265,8 @@ class DynamicalSystem(ABC):
         }
         arrays = {k: np.ascontiguousarray(a) for k, a in self._arrays().items()}
         arrays["goal"] = np.array(self.goal_)
+        for key, array in arrays.items():
+            _check_numbers(key, array)
         target = Path(path)
         partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
         partial.write_bytes(
@@ -257,20 +284,43 @@ class DynamicalSystem(ABC):
                 f"Expected {path} to hold a {cls.name!r} model, got {header['method']!r}."
             )
         try:
-            system = cls(cls.Config(**_as_tuples(header["config"])))
-            system.n_dims_ = int(header["n_dims"])
-            goal = arrays.pop("goal")
-            if goal.shape != (system.n_dims_,):
-                raise ValueError(f"goal of shape {goal.shape} for n_dims {system.n_dims_}")
-            system.goal_ = goal
-            system._restore(arrays)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            config, n_dims = header["config"], header["n_dims"]
+            if not isinstance(config, dict):
+                raise ValueError(f"expected a config of settings by name, got {config!r}")
+            if type(n_dims) is not int or n_dims < 1:
+                raise ValueError(f"expected n_dims to be a whole number >= 1, got {n_dims!r}")
+            system = cls(cls.Config(**_as_tuples(config)))
+            system.n_dims_ = n_dims
+            system.goal_ = np.asarray(arrays.pop("goal"), dtype=np.float64)
+            if system.goal_.shape != (n_dims,):
+                raise ValueError(f"expected a goal of shape {(n_dims,)}, got {system.goal_.shape}")
+            with np.errstate(all="ignore"):  # absurd numbers are told by the checks
+                system._restore(arrays)
+            if (names := sorted(system._arrays())) != sorted(arrays):
+                raise ValueError(f"expected the arrays {names}, got {sorted(arrays)}")
+        except KeyError as error:
+            raise ModelFileError(
+                f"{path} is no whole {cls.name!r} model: expected {error} in it, got none."
+            ) from error
+        except _BAD_FILE as error:
             raise ModelFileError(f"{path} is no whole {cls.name!r} model: {error}.") from error
         return system
 
 
 class ModelFileError(ValueError):
     """A model file is not what it should be."""
+
+
+_BAD_FILE = (
+    safetensors.SafetensorError,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RuntimeError,
+    TypeError,
+    ValueError,  # np.linalg.LinAlgError too
+)
+"""What reading a file that `save` did not write may raise: its contents are anyone's."""
 
 
 def read_model_file(
@@ -281,13 +331,16 @@ def read_model_file(
         with safetensors.safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {})["iflow_gym"])
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no dict)
-        version = int(header["schema_version"])
-        expected = {"method", "config", "n_dims"}
-        if missing := expected - set(header):
-            raise KeyError(f"header without {sorted(missing)}")
+        if not isinstance(header, dict):
+            raise ValueError(f"its header is {header!r}")
+        if missing := {"schema_version", "method", "config", "n_dims"} - set(header):
+            raise ValueError(f"its header is without {sorted(missing)}")
+        version = header["schema_version"]
+        if type(version) is not int or version < 1:
+            raise ValueError(f"its schema version is {version!r}")
     except FileNotFoundError:
         raise
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+    except _BAD_FILE as error:
         raise ModelFileError(
             f"Expected {path} to be a model file of iflow-gym, got something else: {error}."
         ) from error
@@ -297,11 +350,69 @@ def read_model_file(
             "upgrade iflow-gym."
         )
     for key, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise ModelFileError(f"Expected finite parameters in {path}, got NaN in {key!r}.")
+        try:
+            _check_numbers(key, array)
+        except ValueError as error:
+            raise ModelFileError(f"{path} is no model of iflow-gym: {error}") from error
     return header, arrays
 
 
 def _as_tuples(config: Mapping[str, Any]) -> dict[str, Any]:
     """JSON has lists where settings have tuples."""
     return {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}
+
+
+def check_positive_definite(matrices: np.ndarray[Any, Any], what: str) -> None:
+    """Raise ValueError unless matrices, shape (..., d, d), are symmetric and positive definite.
+
+    Rows and columns are divided by the diagonal's roots first, so that units do not matter.
+    """
+    variances = np.diagonal(matrices, axis1=-2, axis2=-1)
+    if not (variances > 0).all():
+        raise ValueError(f"expected {what} > 0 on the diagonal, got {variances.min():.3g}")
+    roots = np.sqrt(variances)
+    unit = matrices / roots[..., :, None] / roots[..., None, :]
+    apart = np.abs(unit - np.swapaxes(unit, -1, -2)).max()
+    if not apart <= SYMMETRIC:
+        raise ValueError(f"expected a symmetric {what}, got a scaled asymmetry {apart:.3g}")
+    least = np.linalg.eigvalsh(unit).min()
+    if not least > 0:
+        raise ValueError(
+            f"expected a positive definite {what}, got the scaled eigenvalue {least:.3g}"
+        )
+
+
+def _check_numbers(key: str, array: np.ndarray[Any, Any]) -> None:
+    if array.dtype.kind != "f":
+        raise ValueError(f"Expected real floating numbers in {key!r}, got {array.dtype}.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"Expected finite numbers in {key!r}, got NaN or infinity.")
+
+
+def _steps(dt: float | FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Return times > 0, broadcast to `shape` and flattened."""
+    times = np.asarray(dt, dtype=np.float64)
+    if not ((times > 0) & (times < np.inf)).all():
+        raise ValueError(f"Expected a finite dt > 0 in seconds, got {dt}.")
+    try:
+        return np.broadcast_to(times, shape).reshape(-1)
+    except ValueError:
+        raise ValueError(
+            f"Expected dt of a shape that broadcasts to {shape}, got {times.shape}."
+        ) from None
+
+
+def seconds(dt: float) -> float:
+    """Return one finite time > 0 as a float; raise ValueError for anything else."""
+    return float(_steps(dt, ())[0])
+
+
+def whole_number(n_steps: SupportsIndex) -> int:
+    """Return n_steps as an int >= 0; raise TypeError or ValueError for anything else."""
+    try:
+        count = operator.index(n_steps)
+    except TypeError:
+        raise TypeError(f"Expected n_steps to be a whole number, got {n_steps!r}.") from None
+    if count < 0:
+        raise ValueError(f"Expected n_steps >= 0, got {count}.")
+    return count

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
 from iflow_gym.metrics import Aggregate, aggregate_scores, get_metric, mean_ranks
-from iflow_gym.metrics.stability import GUARANTEES
 from iflow_gym.registration import lasa_id
 from iflow_gym.results import Result
+from iflow_gym.system import GUARANTEE_KINDS
 
 FAMILIES = {
     "LASA-26": tuple(lasa_id(shape) for shape in SINGLE_MOTIONS),
@@ -77,7 +77,7 @@ class Row:
     def guarantees(self) -> tuple[str, ...]:
         """Kinds of guarantee that the cells state, weakest first."""
         kinds = {cell.guarantee.kind for cell in self.cells.values() if cell.guarantee is not None}
-        return tuple(kind for kind in GUARANTEES if kind in kinds)
+        return tuple(kind for kind in GUARANTEE_KINDS if kind in kinds)
 
     def applies(self, metric: str) -> bool:
         """Whether any cell has a value of the metric."""

@@ -9,6 +9,7 @@ Exit status: 0 when it is written, 2 when there is nothing to build it of.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -34,9 +35,8 @@ from iflow_gym.figures import (
     save_figure,
     scatter_figure,
 )
-from iflow_gym.metrics.stability import GUARANTEES
 from iflow_gym.results import Result, ResultFileError, read_results
-from iflow_gym.system import DynamicalSystem, ModelFileError
+from iflow_gym.system import GUARANTEE_KINDS, DynamicalSystem
 
 HERE = Path(__file__).resolve().parent
 
@@ -147,7 +147,7 @@ def draw(boards: Iterable[Board], results_folder: Path) -> dict[str, tuple[Figur
 def styles_of(board: Board) -> dict[str, MethodStyle]:
     """Return the competitors' styles, in the board's order."""
     methods = {
-        row.method: (row.title, row.guarantees[0] if row.guarantees else GUARANTEES[0])
+        row.method: (row.title, row.guarantees[0] if row.guarantees else GUARANTEE_KINDS[0])
         for row in board.competitors
         if row.n_scored
     }
@@ -264,22 +264,37 @@ def panel_of(row: Row, environment: str, title: str, results_folder: Path) -> Fi
         return FieldPanel(title, demonstrations, None, "never run")
     if not cell.ok:
         return FieldPanel(title, demonstrations, None, "failed")
-    system = load_model(cell, results_folder)
-    return FieldPanel(title, demonstrations, system, "" if system else "no model file")
+    system, problem = load_model(cell, results_folder)
+    return FieldPanel(title, demonstrations, system, problem)
 
 
-def load_model(cell: Result, results_folder: Path) -> DynamicalSystem | None:
-    """Return the fitted model beside a record; None where it is absent or the method unknown."""
-    if cell.model is None or cell.method not in METHODS:
-        return None
+def load_model(cell: Result, results_folder: Path) -> tuple[DynamicalSystem | None, str]:
+    """Return the fitted model beside a record, or None, and in a few words why there is none.
+
+    A method that is not in the registry is imported by the ``module:Class`` that the record names.
+    """
+    if cell.model is None:
+        return None, "no model file"
     path = results_folder / cell.path.parent / cell.model
+    if not path.is_file():
+        return None, "no model file"
+    target = cell.method if cell.method in METHODS else cell.target
     try:
-        return load_method(cell.method).load(path)
-    except FileNotFoundError:
-        return None
-    except ModelFileError as error:
-        print(f"build.py: no picture of {path.name}: {error}", file=sys.stderr)
-        return None
+        if target is None:
+            return None, "unknown method"
+        method = load_method(target)
+    except Exception as error:  # whatever a module does on import
+        _complain(path, error)
+        return None, f"{target}\nis not importable"
+    try:
+        return method.load(path), ""
+    except Exception as error:  # ModelFileError, and whatever a method's own code raises
+        _complain(path, error)
+        return None, "no usable model file"
+
+
+def _complain(path: Path, error: Exception) -> None:
+    print(f"build.py: no picture of {path.name}: {error}", file=sys.stderr)
 
 
 def main() -> int:
@@ -290,6 +305,8 @@ def main() -> int:
     parser.add_argument("--results", type=Path, default=HERE / "results", help="folder of records")
     parser.add_argument("--output", type=Path, default=HERE, help="where the page is written")
     options = parser.parse_args()
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # for the models of methods that are not in the registry
     try:
         written = build(options.results, options.output)
     except (FileNotFoundError, NothingToBuildError, ResultFileError) as error:

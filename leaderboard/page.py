@@ -16,10 +16,11 @@ from tables import (
     rank_of,
     shape_name,
     shape_table,
+    shown,
     table,
 )
 
-from iflow_gym.baselines.registry import METHODS
+from iflow_gym.baselines.registry import METHODS, REFERENCES
 from iflow_gym.metrics import METRICS, get_metric, metrics_hash
 from iflow_gym.results import Result
 
@@ -47,6 +48,12 @@ BY_SHAPE = ("frechet", "rmse", "dtw", "converged")
 
 SMALL = ("frechet", "rmse", "dtw", "seds_error", "converged", "spurious_attractors")
 """Columns of a family that is reported beside the headline, in one table."""
+
+MEMORY = (
+    "Memory is the rise of the worker's resident memory during the fit, above what it held before; "
+    "a batch's is shared by its cells."
+)
+"""What `peak_memory_mb` of a record is."""
 
 HEADLINE = "LASA-26"
 """The family that has every table."""
@@ -78,7 +85,7 @@ def footnote(board: Board, found: Aggregates) -> str:
     }
     who = {
         name: sorted(
-            row.title
+            escaped(row.title)
             for row in board.rows
             if any(
                 (a := found[row.method, m.name]) is not None and a.resampled == name
@@ -102,7 +109,8 @@ def footnote(board: Board, found: Aggregates) -> str:
     incomplete = [row for row in board.rows if not row.complete]
     if incomplete:
         text += " Incomplete: " + "; ".join(
-            f"{row.title} {row.coverage} ({len(row.failed)} failed, {row.n_never_run} never run)"
+            f"{escaped(row.title)} {row.coverage} "
+            f"({len(row.failed)} failed, {row.n_never_run} never run)"
             for row in incomplete
         )
         text += (
@@ -116,7 +124,8 @@ def failures(boards: Sequence[Board]) -> list[str]:
     """Return the section of cells that have no scores."""
     lines = [
         [
-            f"{row.title} on {shape_name(cell.environment)}, {board.protocol}, seed {cell.seed}",
+            f"{escaped(row.title)} on {shape_name(cell.environment)}, {board.protocol}, "
+            f"seed {cell.seed}",
             _one_line(cell.reason or ""),
         ]
         for board in boards
@@ -124,7 +133,7 @@ def failures(boards: Sequence[Board]) -> list[str]:
         for cell in row.failed
     ]
     never = [
-        f"- {row.title}: {row.n_never_run} of {row.n_expected} cells of {board.family}, "
+        f"- {escaped(row.title)}: {row.n_never_run} of {row.n_expected} cells of {board.family}, "
         f"{board.protocol}, were never run."
         for board in boards
         for row in board.rows
@@ -170,6 +179,7 @@ def warnings_about(results: Sequence[Result]) -> list[str]:
             mixed = len({r.hashes.get(label) for r in results if r.ok}) > 1
         if mixed:
             found.append(f"The records were made with different versions of {what}.")
+    found += _mixed_rows([r for r in results if r.ok])
     for library in sorted({name for r in results for name in r.versions}):
         used = sorted({r.versions[library] for r in results if library in r.versions})
         if len(used) > 1:
@@ -180,6 +190,52 @@ def warnings_about(results: Sequence[Result]) -> list[str]:
         found.append("The records are of the smoke preset, whose few steps are no scores to quote.")
     if len({str(r.hardware.get("cpu")) for r in results}) > 1:
         found.append("The records were made on different processors: costs do not compare.")
+    return found
+
+
+def _mixed_rows(results: Sequence[Result]) -> list[str]:
+    """Say which methods' records were made by different code, or in a preset by other settings."""
+    groups: dict[tuple[str, str, str], Counter[str]] = {}
+    for r in results:
+        for label, where in (("code", ""), ("config", r.preset)):
+            key = (escaped(r.title), label, where)
+            groups.setdefault(key, Counter())[r.hashes.get(label, "none")] += 1
+    what = {"code": "versions of its code", "config": "settings in the preset"}
+    return [
+        f"The records of {title} were made with different {f'{what[label]} {where}'.rstrip()}: "
+        + ", ".join(f"{name[:12]} ({n} cells)" for name, n in sorted(counts.items()))
+        + "; run `python baselines/run_all.py` again."
+        for (title, label, where), counts in sorted(groups.items())
+        if len(counts) > 1
+    ]
+
+
+def contradictions(board: Board) -> list[str]:
+    """Return where a method states a proof and measurements say otherwise, a sentence for each."""
+    found = []
+    for row in board.competitors:
+        cells = [
+            c
+            for c in row.cells.values()
+            if c.guarantee is not None and c.guarantee.kind == "proved"
+        ]
+        for metric, held, says in (
+            ("converged", 1.0, "not every start converged within the horizon"),
+            ("lyapunov_violation", 0.0, "its Lyapunov function does not fall everywhere"),
+        ):
+            better = get_metric(metric).better
+            values = [
+                (value, shape_name(cell.environment))
+                for cell in cells
+                if (value := cell.metrics.get(metric)) is not None and value != held
+            ]
+            if values:
+                value, where = (min if better == "higher" else max)(values)
+                found.append(
+                    f"{escaped(row.title)} states a *proved* guarantee, but {says} in "
+                    f"{len(values)} of {len(cells)} cells: {get_metric(metric).title.lower()} is "
+                    f"{shown(metric, value)} % on {where}, the worst."
+                )
     return found
 
 
@@ -216,8 +272,7 @@ def render(
         "[`results/`](results); do not edit.",
         "",
     ]
-    if notes := warnings_about(results):
-        page += ["> [!WARNING]", *(f"> - {note}" for note in notes), ""]
+    page += warning(warnings_about(results))
     page += _pictures(figures, ("accuracy-stability",))
     for board in boards:
         full = board.family == HEADLINE
@@ -244,6 +299,11 @@ CAPTIONS = {
 """By name of the figure."""
 
 
+def warning(notes: Sequence[str]) -> list[str]:
+    """Return sentences in a box that GitHub colours; nothing for none."""
+    return ["> [!WARNING]", *(f"> - {note}" for note in notes), ""] if notes else []
+
+
 def _pictures(figures: Mapping[str, str], names: Sequence[str]) -> list[str]:
     lines: list[str] = []
     for name in names:
@@ -259,6 +319,7 @@ def board_section(board: Board, length_unit: str, *, full: bool) -> list[str]:
     page += [f"{len(board.environments)} shapes, {PROTOCOLS[board.protocol]}.", ""]
     if note := NOTES.get((board.family, board.protocol)):
         page += [note, ""]
+    page += warning(contradictions(board))
     first = {
         "Mean rank": lambda row: rank_of(board, row),
         "Cells": lambda row: row.coverage,
@@ -282,7 +343,7 @@ def board_section(board: Board, length_unit: str, *, full: bool) -> list[str]:
     page += [f"<sub>{_statistics(DENSITY)}</sub>", ""]
     page += ["### Cost", ""]
     page += aggregate_table(board, found, COST, length_unit, references=False)
-    page += [f"<sub>{_statistics(COST)} {_batches(board)}</sub>", ""]
+    page += [f"<sub>{_statistics(COST)} {MEMORY} {_batches(board)}</sub>", ""]
     return page
 
 
@@ -299,7 +360,7 @@ def _batches(board: Board) -> str:
     for row in board.rows:
         sizes = [float(c.fit.get("batch_size") or 1) for c in row.cells.values() if c.ok]
         if sizes and max(sizes) > 1:
-            together.append(f"{row.title} (up to {max(sizes):.0f} together)")
+            together.append(f"{escaped(row.title)} (up to {max(sizes):.0f} together)")
     if not together:
         return ""
     return (
@@ -372,7 +433,7 @@ def _times(results: Sequence[Result]) -> str:
     integrators: dict[str, set[str]] = {}
     for result in results:
         if result.integrator is not None:
-            integrators.setdefault(result.integrator, set()).add(result.title)
+            integrators.setdefault(result.integrator, set()).add(escaped(result.title))
     kinds = "; ".join(f"{k}: {', '.join(sorted(v))}" for k, v in sorted(integrators.items()))
     return f"{spread}, by shape ({kinds or 'integrators not recorded'})"
 
@@ -385,7 +446,8 @@ def _reasons(boards: Sequence[Board]) -> list[str]:
             for cell in row.cells.values():
                 if cell.guarantee is not None:
                     text = escaped(cell.guarantee.reason).rstrip(".")
-                    reasons.setdefault(row.title, f"{row.title}, *{cell.guarantee.kind}*: {text}.")
+                    title = escaped(row.title)
+                    reasons.setdefault(title, f"{title}, *{cell.guarantee.kind}*: {text}.")
     return [reasons[title] for title in sorted(reasons)]
 
 
@@ -397,8 +459,10 @@ def _span(created: Iterable[str]) -> str:
 def _hardware(results: Sequence[Result]) -> list[str]:
     return sorted(
         {
-            f"{h.get('cpu')}, {h.get('cores')} cores, {h.get('threads')} thread(s) a fit, "
-            f"{h.get('platform')}"
+            escaped(
+                f"{h.get('cpu')}, {h.get('cores')} cores, {h.get('threads')} thread(s) a fit, "
+                f"{h.get('platform')}"
+            )
             for h in (result.hardware for result in results)
         }
     )
@@ -414,11 +478,12 @@ def _versions(results: Sequence[Result]) -> list[str]:
 
 def _commands(results: Sequence[Result]) -> list[str]:
     """Return the run for each preset, naming the methods that are not in the registry."""
-    foreign = sorted({r.method for r in results if not r.reference} - set(METHODS))
+    known = {*METHODS, *REFERENCES}
+    foreign = sorted({r.target or r.method for r in results if r.method not in known})
     lines = [
         f"$ python baselines/run_all.py --preset {preset} --output leaderboard/results"
         for preset in sorted({r.preset for r in results})
     ]
     if foreign:
-        lines.append(f"# and --methods package.module:Class for {', '.join(foreign)}")
+        lines.append(f"# and --methods {' '.join(foreign)}")
     return lines

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -87,10 +88,9 @@ def table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
 
 
 def escaped(text: str) -> str:
-    """Return text without what Markdown would take for a table, a tag or emphasis."""
-    for character, escape in (("|", "\\|"), ("<", "&lt;"), ("*", "\\*")):
-        text = text.replace(character, escape)
-    return text
+    """Return text in one line, without what Markdown takes for a table, a tag, a link, emphasis."""
+    text = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return re.sub(r"[\\|*_`\[\]]", r"\\\g<0>", text)
 
 
 # Tables of a board --------------------------------------------------------------------------
@@ -158,7 +158,7 @@ def aggregate_table(
         emphasised(
             row,
             [
-                row.title,
+                escaped(row.title),
                 *(function(row) for function in before.values()),
                 *(column[row.method] for column in columns),
             ],
@@ -236,7 +236,7 @@ def shape_table(board: Board, metric: str) -> list[str]:
                 text = f"**{text}**"
             cells.append(text)
         lines.append([shape_name(environment), *cells])
-    titles = [f"*{row.title}*" if row.reference else row.title for row in rows]
+    titles = [f"*{escaped(row.title)}*" if row.reference else escaped(row.title) for row in rows]
     return table(["Shape", *titles], lines)
 
 

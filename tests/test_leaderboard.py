@@ -303,7 +303,80 @@ def test_records_of_other_metrics_than_the_checkouts_are_warned_of(builder):
 
 
 def test_records_that_compare_are_not_warned_of(builder):
-    assert "WARNING" not in render(builder, sweep("good") + sweep("other", 2.0))
+    other = sweep("other", 2.0, guarantee=Guarantee("none", "made up"))
+    assert "WARNING" not in render(builder, sweep("good") + other)
+    hashes = {"metrics": metrics_hash(), "core": "c", "code": "of another method"}
+    another = [record("another", s, hashes={**hashes, "data": s}) for s in SINGLE_MOTIONS]
+    assert "WARNING" not in render(builder, sweep("good") + another)
+
+
+@pytest.mark.parametrize(
+    ("label", "preset", "message"),
+    [
+        ("code", "standard", "records of Good were made with different versions of its code: "),
+        ("code", "full", "records of Good were made with different versions of its code: "),
+        (
+            "config",
+            "standard",
+            "records of Good were made with different settings in the preset st",
+        ),
+        ("config", "full", None),  # other settings are what presets are for
+    ],
+)
+def test_records_of_a_method_that_do_not_compare_are_warned_of(builder, label, preset, message):
+    shapes = SINGLE_MOTIONS[:3]
+    new = [
+        record("good", s, preset=preset, hashes={**record("good", s).hashes, label: "new"})
+        for s in shapes
+    ]
+    text = render(builder, sweep("good", shapes=SINGLE_MOTIONS[3:]) + new)
+    if message is None:
+        assert "records of Good were made" not in text
+    else:
+        assert message in text.split("\n## ")[0]
+        assert "new (3 cells), none (23 cells)" in text
+
+
+@pytest.mark.parametrize(
+    ("kind", "metric", "value", "message"),
+    [
+        ("proved", "converged", 0.5, "converge"),
+        ("proved", "lyapunov_violation", 1e-4, "in 1 of 26 cells: lyapunov violation is 0.01 % on"),
+        ("proved", "lyapunov_violation", 0.0, None),
+        ("proved", "lyapunov_violation", None, None),
+        ("sampled", "converged", 0.5, None),
+    ],
+)
+def test_a_proof_that_measurements_contradict_is_warned_of(builder, kind, metric, value, message):
+    stated = {"guarantee": Guarantee(kind, "made up")}
+    results = sweep("good", shapes=SINGLE_MOTIONS[1:], **stated)
+    scores = {**results[0].metrics, metric: value}
+    text = render(builder, [*results, record("good", "Angle", metrics=scores, **stated)])
+    if message is None:
+        assert "WARNING" not in text
+    else:
+        (line,) = [line for line in text.splitlines() if line.startswith("> - ")]
+        assert line.startswith("> - Good states a *proved* guarantee, but ")
+        assert message in line
+        assert line.endswith("on Angle, the worst.")
+        assert text.index("## LASA-26") < text.index(line) < text.index("### Accuracy")
+
+
+def test_titles_and_reasons_cannot_break_the_page(builder):
+    title = "A|B\n[x](y) <img> *z* `c` d_e_f \\"
+    clean = "A\\|B \\[x\\](y) &lt;img&gt; \\*z\\* \\`c\\` d\\_e\\_f \\\\"
+    assert builder.tables.escaped(title) == clean
+    results = sweep("good", title=title, shapes=SINGLE_MOTIONS[1:])
+    results += [failed("good", "Angle", reason=f"{title}: no", title=title)]
+    text = render(builder, results)
+    assert "<img>" not in text
+    assert "[x](y)" not in text
+    assert f"| {clean} | " in text
+
+
+def test_what_memory_is_is_said(builder):
+    cost = section(render(builder, sweep("good")), "Cost")
+    assert "rise of the worker's resident memory" in cost
 
 
 def test_tables_have_as_many_cells_in_every_row(builder):
@@ -360,6 +433,34 @@ def test_figures_hold_no_date(builder, results_folder, tmp_path):
     for figure in figures:
         if figure.suffix == ".svg":
             assert "dc:date" not in figure.read_text(encoding="utf-8")
+
+
+def test_a_model_of_anyones_class_is_loaded_or_said_to_be_none(
+    builder, results_folder, tmp_path, monkeypatch
+):
+    system = StableLinear().fit(load_lasa("Sshape"), seed=0)
+    folder = tmp_path / "foreign"
+    (folder / "mine").mkdir(parents=True)
+    system.save(folder / "mine" / "m.safetensors")
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "mine_module.py").write_text(
+        "from iflow_gym.baselines.linear import StableLinear as Mine\n"
+    )
+
+    def load(**changes):
+        fields = {"model": "m.safetensors", "target": "mine_module:Mine", **changes}
+        return builder.load_model(record("mine", "Sshape", **fields), folder)
+
+    loaded, problem = load()
+    assert problem == ""
+    assert (loaded.velocity([1.0, 2.0]) == system.velocity([1.0, 2.0])).all()
+    assert load(target="absent_module:Mine") == (None, "absent_module:Mine\nis not importable")
+    assert load(target="mine_module:Absent") == (None, "mine_module:Absent\nis not importable")
+    assert load(target=None) == (None, "unknown method")
+    assert load(model="absent.safetensors") == (None, "no model file")
+    assert load(model=None) == (None, "no model file")
+    (folder / "mine" / "m.safetensors").write_text("no model")
+    assert load() == (None, "no usable model file")
 
 
 def run_script(*arguments):

@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from iflow_gym.metrics import METRICS
 from iflow_gym.results import (
     SCHEMA_VERSION,
     Result,
@@ -18,6 +19,11 @@ from iflow_gym.results import (
     write_result,
 )
 from iflow_gym.system import Guarantee
+
+
+def scores(**values):
+    """Every metric, None but for these."""
+    return {metric.name: None for metric in METRICS} | values
 
 
 def record(**changes):
@@ -32,7 +38,7 @@ def record(**changes):
         "status": "ok",
         "key": "0" * 64,
         "created": "2026-01-01T00:00:00+00:00",
-        "metrics": {"rmse": 2.5, "settling_time": math.inf, "nll_1": None},
+        "metrics": scores(rmse=2.5, settling_time=math.inf, nll_1=-1.5),
         "medians": {"rmse": 2.25},
         "per_demonstration": {"rmse": [1.0, math.inf, None]},
         "guarantee": Guarantee("proved", "A is Hurwitz."),
@@ -57,8 +63,8 @@ def test_a_record_comes_back_as_it_was_with_infinity_and_null(tmp_path):
 
 
 def test_nan_means_not_applicable(tmp_path):
-    write_result(tmp_path, record(metrics={"rmse": math.nan}))
-    assert read_results(tmp_path)[0].metrics == {"rmse": None}
+    write_result(tmp_path, record(metrics=scores(rmse=math.nan)))
+    assert read_results(tmp_path)[0].metrics == scores()
 
 
 def test_a_failed_record_needs_a_reason_and_only_it():
@@ -82,8 +88,8 @@ def test_names_that_would_leave_the_folder_are_refused():
 
 def test_writing_replaces_and_leaves_nothing_behind(tmp_path):
     write_result(tmp_path, record(seed=1))
-    path = write_result(tmp_path, record(seed=1, metrics={"rmse": 1.0}))
-    assert read_result(path).metrics == {"rmse": 1.0}
+    path = write_result(tmp_path, record(seed=1, metrics=scores(rmse=1.0)))
+    assert read_result(path).metrics == scores(rmse=1.0)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
@@ -107,7 +113,15 @@ def broken_files(path):
         (json.dumps(newer), "upgrade iflow-gym"),
         (json.dumps(less), r"missing \['seed'\]"),
         (json.dumps({**values, "extra": 1}), r"unknown \['extra'\]"),
-        (json.dumps({**values, "metrics": {"rmse": "bad"}}), "expected a number"),
+        (json.dumps({**values, "metrics": scores(rmse="bad")}), "expected a number"),
+        (json.dumps({**values, "metrics": {"rmse": 1.0}}), r"got none of \['converged'"),
+        (json.dumps({**values, "metrics": scores(rmse=-1e-3)}), "rmse to be at least 0"),
+        (json.dumps({**values, "metrics": scores(rmse="-inf")}), "rmse to be at least 0"),
+        (json.dumps({**values, "metrics": scores(rmse=math.nan)}), "rmse to be at least 0"),
+        (json.dumps({**values, "metrics": scores(rmse=10**400)}), "too large"),
+        (json.dumps({**values, "medians": {"dtw": -1.0}}), "dtw to be at least 0"),
+        (json.dumps({**values, "per_demonstration": {"dtw": [-1.0]}}), "dtw to be at least 0"),
+        ("[" * 100_000 + "]" * 100_000, "no whole JSON file"),
         (json.dumps({**values, "metrics": None}), "no valid result record"),
         (json.dumps({**values, "guarantee": {"kind": "proved"}}), "no valid result record"),
     ]
@@ -120,6 +134,11 @@ def test_a_file_that_is_no_record_is_named_with_what_to_do(tmp_path):
         with pytest.raises(ResultFileError, match=message) as caught:
             read_result(path)
         assert str(path) in str(caught.value)
+
+
+def test_a_failed_record_needs_no_metrics(tmp_path):
+    failed = record(status="failed", reason="ValueError: no", metrics={})
+    assert read_result(write_result(tmp_path, failed)) == failed
 
 
 def test_reading_a_folder_lists_every_bad_file_or_hands_each_over(tmp_path):

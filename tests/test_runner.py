@@ -16,7 +16,10 @@ import pytest
 from rich.console import Console
 
 from iflow_gym.baselines.run_all import RunOptions, run_all
+from iflow_gym.baselines.runner import plan, pool
 from iflow_gym.baselines.runner.plan import demonstrations_of
+from iflow_gym.baselines.runner.presets import load_preset
+from iflow_gym.baselines.runner.work import time_limit_of_batch
 from iflow_gym.results import read_result, read_results
 
 ROOT = Path(__file__).parents[1]
@@ -25,7 +28,7 @@ MOTIONS = ("Toy-A-v0", "Toy-B-v0", "Toy-C-v0")
 
 TOYS = '''
 """Toy motions, small, and toy methods: what a fit does depends on the files in this folder."""
-import os, signal, time
+import ctypes, os, signal, time
 from dataclasses import dataclass
 from pathlib import Path
 import gymnasium
@@ -55,6 +58,11 @@ class Config:
     rate: float = 2.0
 
 
+class Mute(Exception):
+    def __str__(self):
+        raise RuntimeError("no words")
+
+
 class Toy(DynamicalSystem):
     name = "toy"
     title = "Toy"
@@ -70,6 +78,18 @@ class Toy(DynamicalSystem):
                 time.sleep(60)
             except Exception:  # a method may swallow what it likes
                 pass
+        if (HERE / f"hang-{shape}").exists():  # no signal, and no other thread, gets through
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+            ctypes.PyDLL(None).sleep(1000)
+        if (HERE / f"interrupt-{shape}").exists():
+            raise KeyboardInterrupt
+        if (HERE / f"exit-{shape}").exists():
+            raise SystemExit(3)
+        if (HERE / f"mute-{shape}").exists():
+            raise Mute
+        if (HERE / f"grow-{shape}").exists():
+            grown = np.ones(20_000_000 // 8)
+            time.sleep(0.2 * grown[0])  # to be seen by what looks now and then
         if (HERE / f"die-{shape}").exists():
             os.kill(os.getpid(), signal.SIGKILL)
         self.rate_ = np.array([self.config.rate])
@@ -79,6 +99,10 @@ class Toy(DynamicalSystem):
 
     @property
     def guarantee(self):
+        if (HERE / "unreadable").exists():
+            return "proved"
+        if (HERE / "unwritable").exists():
+            return object()
         return Guarantee("proved", "linear")
 
     def _arrays(self):
@@ -200,6 +224,16 @@ def test_a_batch_is_fitted_together_and_a_failing_one_cell_by_cell(toys, tmp_pat
     for r in found:
         assert r.metrics["fit_seconds"] == pytest.approx(r.fit["batch_wall_seconds"] / 3)
 
+    # One stale cell: its batch is fitted whole, and the others' records stay.
+    path = output / found_path(found, "Toy-B-v0")
+    path.unlink()
+    kept = {r.environment: r.created for r in found if "Toy-B" not in r.environment}
+    assert "3 cells, 2 up to date, 1 to do" in run(output, "toys:Together")[1]
+    assert (toys / "batches").read_text().split() == ["3", "3"]
+    assert read_result(path).fit["batch_size"] == 3
+    again = by_environment(output, "together").values()
+    assert {r.environment: r.created for r in again if r.environment in kept} == kept
+
     (toys / "raise-Toy-C").touch()
     status, text = run(output, "toys:Together", force=True)
     assert status == 1
@@ -208,6 +242,72 @@ def test_a_batch_is_fitted_together_and_a_failing_one_cell_by_cell(toys, tmp_pat
     assert {name: r.ok for name, r in again.items()} == {s: s != "Toy-C-v0" for s in MOTIONS}
     assert again["Toy-A-v0"].fit["batch_size"] == 1
     assert not (output / "together" / "Toy-C-v0.reproduction.seed0.safetensors").exists()
+
+
+def found_path(results, environment):
+    (path,) = [r.path for r in results if r.environment.endswith(environment)]
+    return path
+
+
+@pytest.mark.skipif(os.name != "posix", reason="blocks a signal")
+def test_a_worker_that_no_alarm_stops_is_killed_and_costs_its_cell_alone(
+    toys, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pool, "GRACE_SECONDS", 0.5)
+    output = tmp_path / "results"
+    (toys / "hang-Toy-B").touch()
+    status, text = run(output, "toys:Together", "toys:Other", time_limit=2.0)
+    assert status == 1
+    assert "together: 3 cells could not be fitted together in 2 s (and their worker" in text
+    for method in ("together", "other"):
+        found = by_environment(output, method)
+        assert {name: r.ok for name, r in found.items()} == {s: s != "Toy-B-v0" for s in MOTIONS}
+        assert found["Toy-B-v0"].reason == "exceeded its time limit of 2 s (and was killed)"
+
+
+def test_whatever_a_method_raises_or_says_is_a_failed_cell(toys, tmp_path):
+    output = tmp_path / "results"
+    for fault, shape in (("interrupt", "A"), ("exit", "B"), ("mute", "C")):
+        (toys / f"{fault}-Toy-{shape}").touch()
+    for method in ("toy", "together"):
+        assert run(output, f"toys:{method.capitalize()}", jobs=1)[0] == 1
+        found = by_environment(output, method)
+        reasons = [found[name].reason.splitlines()[0] for name in MOTIONS]
+        assert reasons == [
+            "KeyboardInterrupt",
+            "SystemExit: 3",
+            "Mute: (its message cannot be shown: RuntimeError)",
+        ]
+    for file in toys.glob("*-Toy-*"):
+        file.unlink()
+    for fault, reason in (
+        ("unwritable", "TypeError: Object of type object is not JSON serializable"),
+        ("unreadable", "ResultFileError: "),
+    ):
+        (toys / fault).touch()
+        status, text = run(output, "toys:Toy", envs=MOTIONS[:1])
+        assert status == 1
+        assert f"FAILED, {reason}" in text
+        assert not (output / "toy" / "Toy-A-v0.reproduction.seed0.safetensors").exists()
+        (toys / fault).unlink()
+
+
+def test_memory_is_the_rise_during_the_fit(toys, tmp_path):
+    """A worker holds some 300 MB before it begins; 20 MB are allocated, and pages round."""
+    (toys / "grow-Toy-B").touch()
+    run(tmp_path / "results", "toys:Toy", jobs=1)
+    found = by_environment(tmp_path / "results", "toy")
+    rises = [found[name].metrics["peak_memory_mb"] for name in MOTIONS]
+    assert all(0 <= rise < 100 for rise in rises)
+    assert rises[1] > 15
+
+
+def test_the_limit_of_a_batch_is_that_of_a_quarter_of_its_cells_one_by_one(toys):
+    (entry,) = plan.select_entries(["toys:Together"], "smoke")
+    cells = plan.make_cells([entry], [f"iflow/{name}" for name in MOTIONS], load_preset("smoke"))
+    limit = cells[0].time_limit
+    assert time_limit_of_batch(cells) == limit
+    assert time_limit_of_batch(cells * 5) == limit * 15 / 4
 
 
 def test_a_worker_that_dies_costs_only_its_own_cell(toys, tmp_path):
@@ -266,3 +366,24 @@ def test_a_truncated_record_is_redone(toys, tmp_path):
     status, text = run(output, "replay", envs=("LASA-Line-v0",))
     assert (status, "0 up to date, 1 to do" in text) == (0, True)
     assert read_result(path).metrics["rmse"] == record.metrics["rmse"]
+
+
+def test_the_page_on_adding_a_method_does_what_it_says(tmp_path):
+    """Its class and its two commands, from a folder that knows nothing of the checkout."""
+    page = (ROOT / "docs" / "adding-a-method.md").read_text()
+    (source,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.M | re.S)
+    (tmp_path / "my_module.py").write_text(source)
+    score, draw = re.findall(r"^python .*$", page, flags=re.M)
+    assert "'LASA-S*'" in score
+    score = score.replace("'LASA-S*'", "LASA-Sshape-v0 --protocol reproduction --jobs 1")
+    for command in (score, draw):
+        words = command.replace("<checkout>", str(ROOT)).split()[1:]
+        done = subprocess.run(
+            [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+    (result,) = read_results(tmp_path / "results")
+    assert (result.ok, result.target) == (True, "my_module:Proportional")
+    assert "| Proportional | " in (tmp_path / "board" / "LEADERBOARD.md").read_text()
+    assert (tmp_path / "board" / "figures" / "methods.png").is_file()

@@ -15,9 +15,10 @@ import pytest
 
 from iflow_gym.baselines import registry
 from iflow_gym.baselines.registry import METHODS, UnknownNameError, load_method
-from iflow_gym.baselines.runner import plan, presets
+from iflow_gym.baselines.runner import fingerprint, plan, presets
 from iflow_gym.baselines.runner.fingerprint import method_code
 from iflow_gym.baselines.runner.presets import PRESETS, PresetError, load_preset
+from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
 
 ROOT = Path(__file__).parents[1]
 
@@ -234,28 +235,74 @@ def test_the_core_and_the_metrics_change_every_key(make_toy, monkeypatch):
 # Jobs -------------------------------------------------------------------------------------
 
 
-def jobs_of(make_toy, n_workers, batched, n_environments, preset="standard"):
-    (entry,) = plan.select_entries([make_toy(f"toy_{batched}_{n_environments}".lower())], preset)
-    entry = dataclasses.replace(entry, batched=batched)
-    environments = plan.select_environments(["LASA-*"])[:n_environments]
-    cells = plan.make_cells([entry], environments, load_preset(preset))
-    jobs = plan.make_jobs(cells, n_workers)
-    assert sorted(c.key for job in jobs for c in job) == sorted(c.key for c in cells)
-    return jobs
+@pytest.fixture
+def make_cells(make_toy):
+    """Cells of a toy that is fitted in batches, or is not, on environments of LASA."""
+
+    def make(environments, batched=True, preset="standard"):
+        (entry,) = plan.select_entries([make_toy("toy_jobs")], preset)
+        entry = dataclasses.replace(entry, batched=batched)
+        return plan.make_cells([entry], environments, load_preset(preset))
+
+    return make
 
 
-def test_cells_that_are_fitted_together_are_split_among_the_workers(make_toy):
-    assert [len(j) for j in jobs_of(make_toy, 2, True, 30)] == [15, 15, 15, 15]
-    for job in jobs_of(make_toy, 2, True, 30):
-        assert len({c.protocol for c in job}) == 1
-    small = [4] * 6 + [3] * 2
-    assert [len(j) for j in jobs_of(make_toy, 64, True, 30)] == [*small, *small]
-    assert [len(j) for j in jobs_of(make_toy, 2, True, 3)] == [3, 3]
-    assert [len(j) for j in jobs_of(make_toy, 1, True, 30)] == [30, 30]
+LASA = [f"iflow/LASA-{shape}-v0" for shape in (*SINGLE_MOTIONS, *MULTI_MODELS)]
 
 
-def test_others_are_a_job_each(make_toy):
-    assert [len(j) for j in jobs_of(make_toy, 2, False, 5)] == [1] * 10
+@pytest.mark.parametrize(
+    ("n", "sizes"), [(30, [15, 15]), (3, [3]), (15, [15]), (16, [8, 8]), (1, [1])]
+)
+def test_batches_are_of_one_protocol_and_differ_by_one_cell_at_most(make_cells, n, sizes):
+    cells = make_cells(LASA[:n])
+    jobs = plan.make_jobs(cells, cells)
+    assert [len(job.batch) for job in jobs] == sizes * 2
+    assert sorted(c.key for job in jobs for c in job.cells) == sorted(c.key for c in cells)
+    for job in jobs:
+        assert job.cells == job.batch
+        assert len({c.protocol for c in job.batch}) == 1
+        assert {c.batch for c in job.batch} == {tuple(str(c.path) for c in job.batch)}
+
+
+def test_a_batch_does_not_depend_on_the_order_nor_on_what_is_up_to_date(make_cells):
+    cells = make_cells(LASA)
+    assert {c.path: c.key for c in cells} == {c.path: c.key for c in make_cells(LASA[::-1])}
+    stale = [cells[0], cells[7], cells[20]]
+    whole = {c.path: job.batch for job in plan.make_jobs(cells, cells) for c in job.batch}
+    jobs = plan.make_jobs(cells, stale)
+    assert [len(job.batch) for job in jobs] == [15, 15]
+    assert [job.cells for job in jobs] == [(cells[0], cells[7]), (cells[20],)]
+    for job in jobs:
+        assert job.batch == whole[job.cells[0].path]
+
+
+def test_the_company_in_a_batch_is_in_the_key_and_only_where_there_are_batches(make_cells):
+    for batched in (True, False):
+        few, many = (
+            {c.path: c.key for c in make_cells(environments, batched=batched)}
+            for environments in (LASA[:3], LASA[:4])
+        )
+        assert all((many[path] != key) == batched for path, key in few.items())
+
+
+def test_others_are_a_job_each(make_cells):
+    cells = make_cells(LASA[:5], batched=False)
+    assert [(job.batch, job.cells) for job in plan.make_jobs(cells, cells[:2])] == [
+        ((cell,), (cell,)) for cell in cells[:2]
+    ]
+
+
+def test_how_a_cell_is_scored_is_in_the_key_and_what_is_printed_is_not(monkeypatch):
+    before = fingerprint.core_hash()
+    source = fingerprint._source
+    for module, counts in (("scoring", True), ("work", False), ("report", False)):
+        changed = f"iflow_gym.baselines.runner.{module}"
+
+        def edited(name, changed=changed):
+            return source(name) + "\nEDITED = 1\n" if name == changed else source(name)
+
+        monkeypatch.setattr(fingerprint, "_source", edited)
+        assert (fingerprint.core_hash() != before) == counts, module
 
 
 def test_the_command_line_explains_itself_and_refuses_in_a_line(tmp_path):

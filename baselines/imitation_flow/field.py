@@ -14,7 +14,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from iflow_gym.baselines.ornstein_uhlenbeck import transition
 from iflow_gym.demonstrations import FloatArray
+
+NAMES = ("rotation", "hidden_weight", "hidden_bias", "out_weight", "out_bias")
+"""The flow's arrays, in the order of `Layer`."""
 
 
 class Layer(NamedTuple):
@@ -32,11 +36,13 @@ class Flow:
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], log_scale_bound: float) -> None:
         self.bound = log_scale_bound
-        names = ("rotation", "hidden_weight", "hidden_bias", "out_weight", "out_bias")
-        values = [np.asarray(arrays[name], dtype=np.float64) for name in names]
-        n_layers, d, _ = values[0].shape
+        values = [np.asarray(arrays[name], dtype=np.float64) for name in NAMES]
+        shapes = [v.shape for v in values]
+        if [len(s) for s in shapes] != [3] * 5:
+            raise ValueError(f"expected {', '.join(NAMES)} with three axes each, got {shapes}")
+        n_layers, d, _ = shapes[0]
         self.n_dims, self.n_kept = d, d // 2
-        moved, hidden = d - d // 2, values[1].shape[-1]
+        moved, hidden = d - d // 2, shapes[1][-1]
         expected = [
             (n_layers, d, d),
             (n_layers, self.n_kept, hidden),
@@ -44,8 +50,11 @@ class Flow:
             (n_layers, hidden, 2 * moved),
             (n_layers, 1, 2 * moved),
         ]
-        if (shapes := [v.shape for v in values]) != expected:
-            raise ValueError(f"expected arrays {names} of shapes {expected}, got {shapes}")
+        if n_layers < 1 or shapes != expected:
+            raise ValueError(
+                f"expected {', '.join(NAMES)} of at least one layer and of shapes {expected}, got "
+                f"{shapes}"
+            )
         self.layers = [Layer(*layer) for layer in zip(*values, strict=True)]
 
     def _hidden(self, layer: Layer, kept: FloatArray) -> FloatArray:
@@ -104,7 +113,6 @@ class Latent:
     def __init__(self, drift: FloatArray, diffusion: FloatArray) -> None:
         self.drift, self.diffusion = drift, diffusion
         self.symmetric = (drift + drift.T) / 2
-        self.stationary = scipy.linalg.solve_continuous_lyapunov(drift, -diffusion)
 
     def propagators(self, times: FloatArray) -> FloatArray:
         """exp(A t) for times of shape (n,): shape (n, d, d)."""
@@ -116,11 +124,5 @@ class Latent:
         return scipy.linalg.expm(self.drift * unique[:, None, None])[index.reshape(-1)]
 
     def transition(self, time: float) -> tuple[FloatArray, FloatArray]:
-        """Propagator and covariance (d, d) of z_t | z_0, by Van Loan's block exponential."""
-        d = len(self.drift)
-        block = np.zeros((2 * d, 2 * d))
-        block[:d, :d], block[:d, d:], block[d:, d:] = -self.drift, self.diffusion, self.drift.T
-        exponential = scipy.linalg.expm(block * time)
-        forward = exponential[d:, d:].T
-        covariance = forward @ exponential[:d, d:]
-        return forward, (covariance + covariance.T) / 2
+        """Propagator and covariance (d, d) of z_t | z_0."""
+        return transition(self.drift, self.diffusion, time)

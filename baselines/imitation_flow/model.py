@@ -24,10 +24,22 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
-from iflow_gym.baselines.imitation_flow.field import Flow, Latent
+from iflow_gym.baselines.imitation_flow.field import NAMES, Flow, Latent
 from iflow_gym.baselines.imitation_flow.training import BatchedModel, Scales, train
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.system import DynamicalSystem, Guarantee
+from iflow_gym.system import (
+    DynamicalSystem,
+    Guarantee,
+    check_positive_definite,
+    seconds,
+    whole_number,
+)
+
+ORTHOGONAL = 1e-6
+"""How far R^T R of a rotation in a file may be from the identity: its inverse is taken as R^T."""
+
+INVERSE = 1e-6
+"""How far h(h^-1(x*)) may be from x*, in lengths of the motion."""
 
 
 class ImitationFlow(DynamicalSystem):
@@ -39,6 +51,10 @@ class ImitationFlow(DynamicalSystem):
     The noise K dB is additive: the mean converges to the goal, and the state is ultimately bounded
     around it with a stationary density. It does not come to rest there, since L|z|^2 =
     2 z^T A z + tr(K K^T) is positive close to the attractor. `guarantee` speaks of the mean.
+
+    `fit_many` trains motions of like counts and dimensions in one batch, each from its own seed.
+    What trains beside a motion changes the rounding of its sums and nothing else, but training
+    amplifies rounding: after a full training a fit is as good and not bit for bit the one alone.
 
     Examples
     --------
@@ -99,7 +115,7 @@ class ImitationFlow(DynamicalSystem):
         }
         arrays["rotation"] = _nearest_orthogonal(arrays["rotation"])
         arrays["scales"] = np.array([scales.length, scales.time])
-        self._restore(arrays)
+        self._adopt(arrays, demonstrations.n_dims)
 
     # The mean dynamics --------------------------------------------------------------------
 
@@ -166,9 +182,11 @@ class ImitationFlow(DynamicalSystem):
     ) -> FloatArray:
         """Draw trajectories of the stochastic system from x0 (..., d).
 
-        The transitions are exact for any dt (seconds). Returns shape (..., n_steps + 1, d).
+        The transitions are exact for any dt > 0 (seconds), n_steps is a whole number >= 0. Returns
+        shape (..., n_steps + 1, d).
         """
         states, shape = self._states(x0)
+        n_steps, dt = whole_number(n_steps), seconds(dt)
         z, _ = self._encode(states)
         forward, covariance = self._latent.transition(dt / self._time)
         root = np.linalg.cholesky(covariance)
@@ -187,17 +205,39 @@ class ImitationFlow(DynamicalSystem):
         return dict(self._parameters)
 
     def _restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        self._parameters = dict(arrays)
-        drift, diffusion = arrays["drift"], arrays["diffusion"]
-        self._flow = Flow(arrays, self.config.log_scale_bound)
-        d = self._flow.n_dims
-        if drift.shape != (d, d) or diffusion.shape != (d, d):
-            raise ValueError(f"expected drift and diffusion of shape {(d, d)}, got {drift.shape}")
-        if np.linalg.eigvalsh(drift + drift.T).max() >= 0:
-            raise ValueError("the drift's symmetric part is not negative definite")
+        self._adopt(arrays, self.n_dims_)
+
+    def _adopt(self, arrays: Mapping[str, NDArray[Any]], d: int) -> None:
+        """Take the parameters over and check all that Lemma 1 needs of them."""
+        names = (*NAMES, "drift", "diffusion", "scales")
+        parameters = {k: np.asarray(arrays[k], dtype=np.float64) for k in names}
+        rotation, drift, diffusion, scales = (
+            parameters[k] for k in ("rotation", "drift", "diffusion", "scales")
+        )
+        flow = Flow(parameters, self.config.log_scale_bound)
+        shapes = [rotation.shape[1:], drift.shape, diffusion.shape, scales.shape]
+        if shapes != (expected := [(d, d), (d, d), (d, d), (2,)]):
+            raise ValueError(
+                f"expected each rotation, drift, diffusion and scales of shapes {expected}, got "
+                f"{shapes}"
+            )
+        if not (scales > 0).all():
+            raise ValueError(f"expected scales of length and time > 0, got {scales}")
+        turned = np.linalg.norm(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(d), axis=(1, 2))
+        if not (off := turned.max()) <= ORTHOGONAL:
+            raise ValueError(f"expected orthogonal rotations, got |R^T R - I| = {off:.3g}")
+        if not (slowest := np.linalg.eigvalsh(drift + drift.T).max() / 2) < 0:
+            raise ValueError(
+                "expected a drift whose symmetric part is negative definite, got the eigenvalue "
+                f"{slowest:.3g}"
+            )
+        check_positive_definite(diffusion, "diffusion")
+        attractor = flow.inverse(np.zeros((1, d)))[0]
+        if not (off := np.abs(flow.forward(attractor)).max()) <= INVERSE:
+            raise ValueError(f"expected a flow that inverts at the goal, got an error of {off:.3g}")
+        self._parameters, self._flow, self._attractor = parameters, flow, attractor
         self._latent = Latent(drift, diffusion)
-        self._length, self._time = (float(s) for s in arrays["scales"])
-        self._attractor = self._flow.inverse(np.zeros((1, d)))[0]
+        self._length, self._time = (float(s) for s in scales)
 
 
 def _nearest_orthogonal(rotations: NDArray[Any]) -> FloatArray:

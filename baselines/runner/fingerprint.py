@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 CORE = (
+    "iflow_gym.baselines.runner.scoring",
     "iflow_gym.demonstrations",
     "iflow_gym.evaluate",
     "iflow_gym.policy",

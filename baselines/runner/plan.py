@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
-from itertools import groupby
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,11 @@ from iflow_gym.registration import POINT_MASS_ID
 from iflow_gym.results import ResultFileError, read_result, result_path, short_name
 from iflow_gym.system import DynamicalSystem
 
-LEAST_BATCH = 4
-"""Cells that are fitted together at least, where there are that many: fewer gain little."""
-
-LARGEST_BATCH = 32
-"""Cells that are fitted together at most: what a failure in a batch costs stays bounded."""
+BATCH_SIZE = 15
+"""Cells that are fitted together at most, for methods that can. Half of LASA's shapes: two workers
+have the same to do, and what a failure in a batch costs stays bounded. Training rounds differently
+in another company, which scores show, so that batches depend on the selected environments alone:
+not on the number of workers, nor on what is up to date."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,8 @@ class Cell:
     preset: str
     time_limit: float
     """Seconds."""
+    batch: tuple[str, ...]
+    """Paths of the cells that are fitted together with this one, itself among them."""
     key: str
     hashes: dict[str, str]
 
@@ -96,8 +99,22 @@ class Cell:
         return f"{self.entry.name} on {where}, {self.protocol}, seed {self.seed}"
 
 
-Job = tuple[Cell, ...]
-"""Cells that one worker does one after the other; several are fitted together."""
+@dataclass(frozen=True)
+class Job:
+    """Cells that one worker does one after the other."""
+
+    batch: tuple[Cell, ...]
+    """What is fitted together: a whole batch, or one cell."""
+    cells: tuple[Cell, ...]
+    """Those of them that are scored and written."""
+
+    def without(self, done: Collection[str]) -> Job:
+        """Return what is left to do when cells of these paths are done."""
+        return Job(self.batch, tuple(c for c in self.cells if str(c.path) not in done))
+
+    def one_by_one(self) -> list[Job]:
+        """Return a job for each cell, which is then fitted alone."""
+        return [Job((cell,), (cell,)) for cell in self.cells]
 
 
 def select_entries(patterns: Sequence[str], preset: str) -> list[Entry]:
@@ -201,41 +218,56 @@ def demonstrations_of(environment: str) -> Demonstrations:
     return demonstrations
 
 
+def make_batches(environments: Sequence[str], *, batched: bool) -> list[tuple[str, ...]]:
+    """Deal environments out into batches of at most `BATCH_SIZE`, whatever their order was."""
+    if not batched:
+        return [(environment,) for environment in environments]
+    n_batches = math.ceil(len(environments) / BATCH_SIZE)
+    # Like cards, so that batches differ by one cell at most.
+    return [tuple(sorted(environments)[i::n_batches]) for i in range(n_batches)]
+
+
 def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Preset) -> list[Cell]:
     """Return all cells of a preset, each with its key.
 
     The key hashes what decides the scores: the method with its settings and code, the code of the
-    core and of the metrics, the data, the protocol, the seed, and the versions of the libraries
-    that the method or the core use. It does not hash the preset's name or its time limit.
+    core and of the metrics, the data, the protocol, the seed, the batch that the cell is fitted
+    in, and the versions of the libraries that the method or the core use. It does not hash the
+    preset's name or its time limit.
     """
     core, measures = core_hash(), metrics_hash()
     cells = []
     for entry in entries:
         seeds = preset.seeds if entry.stochastic else preset.seeds[:1]
         used = {name: entry.versions.get(name) for name in (*CORE_LIBRARIES, *entry.libraries)}
-        for protocol in preset.protocols:
-            for seed in seeds:
-                for environment in environments:
-                    hashes = {
-                        "data": demonstrations_of(environment).sha256,
-                        "metrics": measures,
-                        "code": entry.code,
-                        "core": core,
-                        "config": sha256_of(entry.config),
-                    }
-                    decisive = [entry.target, environment, protocol, seed, hashes, used]
-                    cells.append(
-                        Cell(
-                            entry=entry,
-                            environment=environment,
-                            protocol=protocol,
-                            seed=seed,
-                            preset=preset.name,
-                            time_limit=preset.time_limit,
-                            key=sha256_of(decisive),
-                            hashes=hashes,
-                        )
+        for protocol, seed, batch in product(
+            preset.protocols, seeds, make_batches(environments, batched=entry.batched)
+        ):
+            paths = tuple(str(result_path(entry.name, e, protocol, seed)) for e in batch)
+            data = [demonstrations_of(environment).sha256 for environment in batch]
+            for environment, sha256 in zip(batch, data, strict=True):
+                hashes = {
+                    "data": sha256,
+                    "metrics": measures,
+                    "code": entry.code,
+                    "core": core,
+                    "config": sha256_of(entry.config),
+                }
+                company = [paths, data]
+                decisive = [entry.target, environment, protocol, seed, hashes, used, company]
+                cells.append(
+                    Cell(
+                        entry=entry,
+                        environment=environment,
+                        protocol=protocol,
+                        seed=seed,
+                        preset=preset.name,
+                        time_limit=preset.time_limit,
+                        batch=paths,
+                        key=sha256_of(decisive),
+                        hashes=hashes,
                     )
+                )
     return cells
 
 
@@ -248,22 +280,17 @@ def is_up_to_date(cell: Cell, folder: Path) -> bool:
     return found.ok and found.key == cell.key
 
 
-def make_jobs(cells: Sequence[Cell], n_workers: int) -> list[Job]:
-    """Split cells into jobs, the large ones first.
+def make_jobs(cells: Iterable[Cell], to_do: Collection[Cell]) -> list[Job]:
+    """Return a job for each batch of `cells` that has one of `to_do`, the large ones first.
 
-    Cells of a method that fits several together are split by protocol into about `n_workers`
-    groups of `LEAST_BATCH` to `LARGEST_BATCH`; others are jobs of their own.
+    The batch is fitted whole, and those to do are scored.
     """
-
-    def of_one_batch(cell: Cell) -> tuple[str, str, str]:
-        return cell.entry.target, cell.protocol, cell.hashes["config"]
-
-    together = sorted((c for c in cells if c.entry.batched), key=of_one_batch)
-    jobs: list[Job] = []
-    for _, group in groupby(together, key=of_one_batch):
-        batch = list(group)
-        size = min(max(math.ceil(len(batch) / n_workers), LEAST_BATCH), LARGEST_BATCH)
-        n_jobs = math.ceil(len(batch) / size)
-        # Dealt out like cards, so that groups differ by one cell at most.
-        jobs += [tuple(batch[i::n_jobs]) for i in range(n_jobs)]
-    return jobs + [(cell,) for cell in cells if not cell.entry.batched]
+    batches: dict[tuple[str, ...], list[Cell]] = defaultdict(list)
+    for cell in cells:
+        batches[cell.batch].append(cell)
+    wanted = {cell.path for cell in to_do}
+    jobs = [
+        Job(tuple(batch), tuple(cell for cell in batch if cell.path in wanted))
+        for batch in batches.values()
+    ]
+    return sorted((job for job in jobs if job.cells), key=lambda job: -len(job.batch))

@@ -8,27 +8,28 @@ import os
 import re
 import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import psutil
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
 from iflow_gym.baselines.runner.plan import Cell, Job
-from iflow_gym.baselines.runner.work import (
-    THREADS,
-    Journal,
-    failed_result,
-    prepare_worker,
-    run_job,
-)
+from iflow_gym.baselines.runner.scoring import THREADS, failed_result
+from iflow_gym.baselines.runner.work import Journal, prepare_worker, run_job
 from iflow_gym.results import write_result
 
 Event = dict[str, Any]
 
 POLL_SECONDS = 0.2
+
+GRACE_SECONDS = 15.0
+"""What a worker may take over its limit, before it is killed: it interrupts itself at the limit,
+and again after `work.REPEAT_SECONDS`, but cannot while a call into C does not return."""
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -41,6 +42,17 @@ THREAD_VARIABLES = (
 
 class WorkersError(RuntimeError):
     """Worker processes die before they do anything."""
+
+
+class Doing(NamedTuple):
+    """What a worker does."""
+
+    job: int
+    path: str | None
+    """Of the cell; None for a batch."""
+    limit: float
+    deadline: float
+    """By `time.monotonic`."""
 
 
 class Pool:
@@ -63,14 +75,18 @@ class Pool:
         self._started: set[int] = set()
         self._done: set[str] = set()
         self._pids: set[int] = set()
+        self._doing: dict[int, Doing] = {}
+        self._overdue: dict[int, Doing] = {}
 
     def run(self, jobs: Sequence[Job]) -> None:
         """Do all jobs; on return every cell has a record.
 
-        Where a worker dies, all others of its executor die with it. The jobs that had not begun go
-        on together; those that had are then done again, each alone, without the cells that have
-        their record. One that dies alone is split into its cells, and a single cell that dies
-        alone becomes a failed one.
+        A worker that is past a time limit and does not stop is killed: its cell fails, or its
+        batch is done cell by cell. Where a worker dies of itself, nobody knows by which job,
+        because all others of its executor die with it: the jobs that had begun are done again,
+        each alone, without the cells that have their record. One that dies alone is split into
+        its cells, and a single cell that dies alone becomes a failed one. All other jobs go on
+        together.
 
         Raises
         ------
@@ -82,30 +98,31 @@ class Pool:
         together, alone = list(jobs), list[Job]()
         try:
             while together:
-                began, waiting, reason = self._round(together, self._n_workers)
-                if waiting and not began:
+                suspects, together, reason = self._round(together, self._n_workers)
+                if together and not self._started:
                     raise WorkersError(f"Expected workers to begin their jobs, but {reason}.")
-                alone += began
-                together = waiting
+                alone += suspects
             while alone:
-                job = alone.pop(0)
-                began, waiting, reason = self._round([job], 1)
-                left = [cell for unfinished in began + waiting for cell in unfinished]
-                if len(job) > 1:
-                    alone = [(cell,) for cell in left] + alone
-                else:
-                    for cell in left:
-                        self._fail(cell, reason)
+                suspects, left, reason = self._round([alone.pop(0)], 1)
+                if not self._started:
+                    suspects, left = left, []
+                for job in suspects:
+                    if len(job.batch) > 1:
+                        left += job.one_by_one()
+                    else:
+                        self._fail(job.cells[0], reason)
+                alone = left + alone
         finally:
             self._sweep()
 
     def _round(self, jobs: Sequence[Job], n_workers: int) -> tuple[list[Job], list[Job], str]:
         """Run jobs in a fresh executor.
 
-        Returns the unfinished cells of jobs that had begun and of those that had not, both empty
+        Returns the jobs that a worker may have died of, what else is left to do, both empty
         unless a worker died, and how it died.
         """
-        self._started.clear()
+        for record in (self._started, self._doing, self._overdue):
+            record.clear()
         with (
             tempfile.TemporaryDirectory(prefix="iflow-gym-run-") as scratch,
             warnings.catch_warnings(),
@@ -132,10 +149,30 @@ class Pool:
         errors = [error for future in futures if (error := future.exception()) is not None]
         if not errors:
             return [], [], ""
-        left = [tuple(c for c in job if str(c.path) not in self._done) for job in jobs]
-        began = [job for i, job in enumerate(left) if job and i in self._started]
-        waiting = [job for i, job in enumerate(left) if job and i not in self._started]
-        return began, waiting, _how_it_died(errors[0])
+        suspects, waiting = list[Job](), list[Job]()
+        for number, job in enumerate(jobs):
+            rest = job.without(self._done)
+            if (killed := self._overdue.get(number)) is not None:
+                waiting += self._after_kill(rest, killed)
+            elif rest.cells:
+                innocent = self._overdue or number not in self._started
+                (waiting if innocent else suspects).append(rest)
+        return suspects, waiting, _how_it_died(errors[0])
+
+    def _after_kill(self, job: Job, killed: Doing) -> list[Job]:
+        """Fail the cell that a worker was killed for; return what is left of its job."""
+        if killed.path is None:
+            text = (
+                f"{job.batch[0].entry.name}: {len(job.batch)} cells could not be fitted together "
+                f"in {killed.limit:g} s (and their worker was killed); now one by one"
+            )
+            self._on_event({"event": "note", "pid": os.getpid(), "text": text})
+            return job.one_by_one()
+        for cell in job.cells:
+            if str(cell.path) == killed.path:
+                self._fail(cell, f"exceeded its time limit of {killed.limit:g} s (and was killed)")
+        rest = job.without(self._done)
+        return [rest] if rest.cells else []
 
     def _follow(self, journal: Journal, futures: dict[Future[None], Job]) -> Iterator[Event]:
         """Yield the journal's events until every future is done; raise what a job itself raised."""
@@ -156,12 +193,32 @@ class Pool:
                     self._pids.add(event["pid"])
                     if event["event"] == "job":
                         self._started.add(event["number"])
-                    elif event["event"] == "done":
-                        self._done.add(event["path"])
+                    elif event["event"] in ("batch", "begin"):
+                        deadline = time.monotonic() + event["limit"] + GRACE_SECONDS
+                        self._doing[event["pid"]] = Doing(
+                            event["number"], event.get("path"), event["limit"], deadline
+                        )
+                    elif event["event"] in ("note", "done"):
+                        self._doing.pop(event["pid"], None)
+                        if event["event"] == "done":
+                            self._done.add(event["path"])
                     yield event
+                self._kill_overdue()
+
+    def _kill_overdue(self) -> None:
+        """Kill workers that are past what they may take."""
+        for pid, doing in list(self._doing.items()):
+            if time.monotonic() > doing.deadline:
+                del self._doing[pid]
+                self._overdue[doing.job] = doing
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    psutil.Process(pid).kill()
 
     def _fail(self, cell: Cell, reason: str) -> None:
+        model = self._folder / cell.path.with_suffix(".safetensors")
+        model.unlink(missing_ok=True)  # of an earlier run
         write_result(self._folder, failed_result(cell, reason))
+        self._done.add(str(cell.path))
         self._on_event(
             {
                 "event": "done",

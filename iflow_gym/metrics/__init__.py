@@ -27,9 +27,7 @@ from iflow_gym.metrics.aggregate import (
 from iflow_gym.metrics.cost import FitCost, measure_cost, median_call_us
 from iflow_gym.metrics.registry import METRICS, Metric, get_metric, metrics_hash
 from iflow_gym.metrics.stability import (
-    GUARANTEES,
     HORIZON,
-    Guarantee,
     box_diagonal,
     converged,
     convergence_tolerance,
@@ -44,13 +42,11 @@ from iflow_gym.metrics.stability import (
 )
 
 __all__ = [
-    "GUARANTEES",
     "HORIZON",
     "METRICS",
     "Aggregate",
     "Bootstrap",
     "FitCost",
-    "Guarantee",
     "Metric",
     "aggregate_scores",
     "box_diagonal",

@@ -207,11 +207,12 @@ METRICS: tuple[Metric, ...] = (
         "lower",
         "cost",
         "Peak memory",
-        "Peak resident memory of the whole process during the fit, 10^6 bytes.",
+        "Rise of the resident memory during the fit above its level at the start, 10^6 bytes; what "
+        "a batch of fits took together is shared.",
     ),
 )
 """All metrics of point-to-point motions that are numbers, in the order of their tables. A method's
-guarantee is a word, one of ``stability.GUARANTEES``."""
+guarantee is a word, `iflow_gym.system.Guarantee`."""
 
 
 def get_metric(name: str) -> Metric:

@@ -10,8 +10,6 @@ Fractions are the means of the boolean functions, through ``fraction``.
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import connected_components
@@ -47,11 +45,6 @@ PERTURBATION_SIZE = 0.25
 """Length of the push, as a fraction of the box's diagonal."""
 LYAPUNOV_STATES = 10_000
 """States at which the Lyapunov function's derivative is tested."""
-
-Guarantee: TypeAlias = Literal["none", "sampled", "verified", "proved"]
-GUARANTEES: tuple[Guarantee, ...] = ("none", "sampled", "verified", "proved")
-"""What a method can say of its stability, weakest first: nothing; seen to hold where tried; checked
-on a bounded region with an error bound; by construction, for every state."""
 
 
 def enlarged_box(low: ArrayLike, high: ArrayLike, factor: float) -> tuple[FloatArray, FloatArray]:

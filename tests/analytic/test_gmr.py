@@ -10,6 +10,7 @@ from sklearn.mixture import GaussianMixture
 from iflow_gym.baselines.gmr import GMR, MixtureField, conditional
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.system import ModelFileError
 
 
 def random_mixture(d, n_components=4, seed=0):
@@ -184,3 +185,36 @@ def test_more_gaussians_than_samples_are_refused():
     short = Demonstrations.from_arrays([np.linspace([1.0, 1.0], [0.0, 0.0], 5)], dt=0.1)
     with pytest.raises(ValueError, match="as many Gaussians as samples, 5, got 6"):
         GMR(n_components=6).fit(short, seed=0)
+
+
+def lopsided(covariances):
+    changed = covariances.copy()
+    changed[0, 0, 1] *= 1.5
+    return changed
+
+
+TAMPERED = {
+    "priors that sum to 5": ("priors_", lambda a: 5 * a, r"priors > 0 that sum to 1, got \["),
+    "a prior of 0": ("priors_", lambda a: np.array([0.0, *a[1:-1], a[-1] + a[0]]), "priors > 0"),
+    "a negative prior": ("priors_", lambda a: np.array([-a[0], *a[1:]]), "priors > 0"),
+    "lopsided": ("covariances_", lopsided, "a symmetric covariance"),
+    "negative": ("covariances_", lambda a: -a, "covariance > 0 on the diagonal"),
+    "indefinite": ("covariances_", lambda a: a + 2 * np.abs(a).max() * (1 - np.eye(4)), "definite"),
+}
+
+
+@pytest.mark.parametrize(("field", "change", "message"), TAMPERED.values(), ids=TAMPERED.keys())
+def test_a_file_of_no_mixture_is_refused(tmp_path, field, change, message):
+    system = GMR(n_components=4).fit(load_lasa("Angle"), seed=0)
+    setattr(system, field, change(getattr(system, field)))
+    with pytest.raises(ModelFileError, match=message):
+        GMR.load(system.save(tmp_path / "model"))
+
+
+@pytest.mark.parametrize("positions", DEGENERATE.values(), ids=DEGENERATE.keys())
+@pytest.mark.parametrize("dt", [1e-6, 0.1, 1e6])
+def test_degenerate_fits_come_back_from_files(tmp_path, positions, dt):
+    """Velocities of any unit beside the positions: what is positive definite stays so."""
+    system = GMR().fit(Demonstrations.from_arrays(positions, dt=dt), seed=0)
+    again = GMR.load(system.save(tmp_path / "model"))
+    np.testing.assert_array_equal(again.covariances_, system.covariances_)

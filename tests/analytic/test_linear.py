@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec, solve_ivp
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.optimize import approx_fprime, minimize
 
 from iflow_gym.baselines.linear import (
@@ -11,10 +11,11 @@ from iflow_gym.baselines.linear import (
     fit_stable_matrix,
     lyapunov_matrix,
     stable_objective,
-    transition_covariance,
 )
+from iflow_gym.baselines.ornstein_uhlenbeck import transition
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.system import ModelFileError
 
 SPIRAL = np.array([[-1.5, 4.0], [-3.0, -2.0]])
 GOAL = np.array([30.0, -7.0])
@@ -31,7 +32,7 @@ def flows_of(matrix, goal=GOAL, n=3, samples=200, duration=4.0, scale=50.0):
         velocities=[x @ matrix.T for x in offsets],
         dt=duration / (samples - 1),
         goal=goal,
-        goal_tolerance=np.inf,
+        goal_tolerance=1e6,
     )
 
 
@@ -142,18 +143,73 @@ def test_the_lyapunov_function_decreases_at_its_stated_rate():
 
 
 def test_lyapunov_matrix_refuses_what_is_not_stable():
-    with pytest.raises(ValueError, match="negative real parts, got 0"):
+    with pytest.raises(ValueError, match="negative real parts beyond rounding, got 0"):
         lyapunov_matrix(np.array([[0.0, 1.0], [-1.0, 0.0]]))
 
 
 @pytest.mark.parametrize("dt", [1e-3, 0.7, 40.0])
 def test_transition_covariance_is_the_integral(dt):
     diffusion = np.array([[2.0, 0.3], [0.3, 1.0]])
-    found = transition_covariance(SPIRAL, diffusion, dt)
+    flow, found = transition(SPIRAL, diffusion, dt)
+    np.testing.assert_allclose(flow, expm(dt * SPIRAL), rtol=1e-10, atol=1e-300)
     exact, _ = quad_vec(
         lambda s: expm(s * SPIRAL) @ diffusion @ expm(s * SPIRAL).T, 0, dt, epsrel=1e-10, limit=2000
     )
     np.testing.assert_allclose(found, exact, rtol=1e-7)
+
+
+DRIFTS = {
+    "spiral": SPIRAL,
+    "stiff": np.diag([-0.05, -300.0]),
+    "far from normal": np.array([[-1.0, 500.0], [0.0, -2.0]]),
+    "3-D": np.array([[-1.0, 0.0, 5.0], [0.0, -3.0, 1.0], [-5.0, 0.0, -2.0]]),
+}
+
+
+@pytest.mark.parametrize("drift", DRIFTS.values(), ids=DRIFTS.keys())
+@pytest.mark.parametrize("size", [1e-14, 1.0, 1e8])
+@pytest.mark.parametrize("time", [1e-4, 1e-2, 1.0, 10.0, 100.0, 1e4, 1e300])
+def test_transitions_of_any_horizon_are_p_less_what_is_left_of_it(drift, size, time):
+    """Q = P - F P Fᵀ with A P + P Aᵀ + D = 0, whose cancellation costs 1e-4 / |A| digits here."""
+    d = len(drift)
+    diffusion = size * (np.eye(d) + 0.5 * np.ones((d, d)))
+    stationary = solve_continuous_lyapunov(drift, -diffusion)
+    flow = expm(min(time, 1e5) * drift)
+    expected = stationary - flow @ stationary @ flow.T
+    found_flow, found = transition(drift, diffusion, time)
+    np.testing.assert_allclose(found_flow, flow, rtol=0, atol=1e-11 * max(1, np.abs(flow).max()))
+    roots = np.sqrt(np.diag(expected))
+    scaled = (found - expected) / np.outer(roots, roots)
+    np.testing.assert_allclose(scaled, 0, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(found, found.T)
+    assert np.linalg.eigvalsh(found / np.outer(roots, roots)).min() > 0
+
+
+def test_a_density_of_a_long_horizon_forgets_the_start():
+    system = StableLinear().fit(load_lasa("Angle"), seed=0)
+    far = 100 * load_lasa("Angle").durations.mean()
+    x, x_next = np.array([[-40.0, 10.0], [3.0, 9.0]]), np.array([[0.1, -0.2]] * 2)
+    value = system.log_prob(x, x_next, far)
+    assert value[0] == pytest.approx(value[1], rel=1e-12)
+    assert value[0] == pytest.approx(system.log_prob(x, x_next, 2 * far)[0], rel=1e-12)
+
+
+def test_a_horizon_beyond_a_recording_is_its_longest():
+    demonstrations = flows_of(SPIRAL, n=2, samples=20)
+    noisy = Demonstrations.from_arrays(
+        [p + np.random.default_rng(1).normal(size=p.shape) for p in demonstrations.positions],
+        dt=demonstrations.dt,
+        goal=GOAL,
+        goal_tolerance=1e6,
+    )
+    cut, longest, twice = (
+        StableLinear(noise_horizons=h).fit(noisy, seed=0).diffusion_
+        for h in ((1, 1000), (1, 19), (1, 19, 1000))
+    )
+    np.testing.assert_array_equal(cut, longest)
+    np.testing.assert_array_equal(cut, twice)
+    shorter = StableLinear(noise_horizons=(1,)).fit(noisy, seed=0).diffusion_
+    assert np.abs(cut - shorter).max() > 1e-3 * np.abs(shorter).max()
 
 
 def test_noise_of_a_simulated_process_is_found():
@@ -161,7 +217,7 @@ def test_noise_of_a_simulated_process_is_found():
     rng = np.random.default_rng(0)
     diffusion, dt, n = np.array([[4.0, 1.0], [1.0, 2.0]]), 0.01, 20_000
     flow = expm(dt * SPIRAL)
-    root = np.linalg.cholesky(transition_covariance(SPIRAL, diffusion, dt))
+    root = np.linalg.cholesky(transition(SPIRAL, diffusion, dt)[1])
     noise = rng.normal(size=(n, 2)) @ root.T
     x = np.empty((n, 2))
     x[0] = 20.0, 10.0
@@ -223,10 +279,30 @@ def test_settings_are_checked(settings, message):
         StableLinear(**settings)
 
 
-def test_a_file_with_an_unstable_matrix_is_refused(tmp_path):
-    from iflow_gym.system import ModelFileError
+TAMPERED = {
+    "unstable": ("matrix_", lambda a: -a, "negative real parts"),
+    "all zero": ("matrix_", np.zeros_like, "negative real parts beyond rounding, got 0"),
+    "negative noise": ("diffusion_", lambda a: -a, "diffusion > 0 on the diagonal, got -"),
+    "no noise": ("diffusion_", np.zeros_like, "diffusion > 0 on the diagonal, got 0"),
+    "lopsided noise": ("diffusion_", lambda a: a + np.diag([a[0, 0]], 1), "a symmetric diffusion"),
+    "indefinite noise": (
+        "diffusion_",
+        lambda a: a[0, 0] * np.array([[1.0, 2.0], [2.0, 1.0]]),
+        "a positive definite diffusion, got the scaled eigenvalue -1",
+    ),
+}
 
+
+@pytest.mark.parametrize(("field", "change", "message"), TAMPERED.values(), ids=TAMPERED.keys())
+def test_a_file_whose_claims_fail_is_refused(tmp_path, field, change, message):
     system = StableLinear().fit(load_lasa("Line"), seed=0)
-    system.matrix_ = -system.matrix_
-    with pytest.raises(ModelFileError, match="negative real parts"):
+    setattr(system, field, change(getattr(system, field)))
+    with pytest.raises(ModelFileError, match=message):
         StableLinear.load(system.save(tmp_path / "model"))
+
+
+@pytest.mark.parametrize("positions", DEGENERATE.values(), ids=DEGENERATE.keys())
+def test_degenerate_fits_come_back_from_files(tmp_path, positions):
+    system = StableLinear().fit(Demonstrations.from_arrays(positions, dt=0.1), seed=0)
+    again = StableLinear.load(system.save(tmp_path / "model"))
+    np.testing.assert_array_equal(again.matrix_, system.matrix_)

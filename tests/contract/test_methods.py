@@ -4,6 +4,7 @@ Each is fitted on thinned LASA shapes with settings that make it quick, so that 
 how good a method is; it says that a method is what `DynamicalSystem` promises.
 """
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -19,6 +20,7 @@ from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.system import (
     SCHEMA_VERSION,
     DynamicalSystem,
+    Guarantee,
     ModelFileError,
     NotFittedError,
     read_model_file,
@@ -219,6 +221,42 @@ def test_wrong_dimensions_are_refused(name):
 
 
 @every_method
+@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan, np.inf])
+def test_times_that_are_none_are_refused(name, dt):
+    system, x = fitted(name), states(n=3)
+    for call in (
+        lambda: system.step(x, dt),
+        lambda: system.step(x, np.array([0.1, dt, 0.1])),
+        lambda: system.rollout(x, 3, dt),
+        lambda: system.log_prob(x, x, dt),
+    ):
+        with pytest.raises(ValueError, match="Expected a finite dt > 0"):
+            call()
+
+
+@every_method
+def test_arguments_that_do_not_fit_are_refused(name):
+    system, x = fitted(name), states(n=3)
+    with pytest.raises(ValueError, match=r"dt of a shape that broadcasts to \(3,\), got \(2,\)"):
+        system.step(x, np.array([0.1, 0.2]))
+    with pytest.raises(ValueError, match="Expected n_steps >= 0, got -1"):
+        system.rollout(x, -1, 0.1)
+    with pytest.raises(TypeError, match=r"Expected n_steps to be a whole number, got 2\.5"):
+        system.rollout(x, 2.5, 0.1)
+    with pytest.raises(ValueError, match=r"one shape, got \(3, 2\) and \(2,\)"):
+        system.log_prob(x, x[0], 0.1)
+
+
+@every_method
+def test_a_rollout_takes_numpys_whole_numbers_and_none_is_the_start(name):
+    system, x = fitted(name), states(n=3)
+    np.testing.assert_array_equal(
+        system.rollout(x, np.int32(2), np.float32(0.5)), system.rollout(x, 2, 0.5)
+    )
+    np.testing.assert_array_equal(system.rollout(x, 0, 0.5), x[:, None])
+
+
+@every_method
 def test_the_field_is_float64_and_leaves_its_input_alone(name):
     x = states()
     kept = x.copy()
@@ -277,12 +315,22 @@ def test_a_rollout_is_repeated_steps_from_its_start(name):
 # Stability ----------------------------------------------------------------------------------
 
 
+def test_a_guarantee_is_one_of_four_and_has_a_reason():
+    for kind in ("proved", "verified", "sampled", "none"):
+        assert Guarantee(kind, "it is so").kind == kind
+    with pytest.raises(ValueError, match="proved, verified, sampled, none, got 'certainly'"):
+        Guarantee("certainly", "it is so")
+    for reason in ("", "  ", None):
+        with pytest.raises(ValueError, match="Expected the reason"):
+            Guarantee("proved", reason)
+
+
 @every_method
 @every_cell
-def test_the_guarantee_is_stated(name, shape):
-    guarantee = fitted(name, shape).guarantee
-    assert guarantee.kind in ("proved", "verified", "sampled", "none")
-    assert len(guarantee.reason) > 20
+def test_what_is_proved_has_a_lyapunov_function(name, shape):
+    system = fitted(name, shape)
+    if system.guarantee.kind == "proved":
+        assert system.lyapunov(states(shape)) is not None
 
 
 @every_method
@@ -419,34 +467,77 @@ def rewritten(path, arrays=None, **changes):
     )
 
 
+HEADERS = {
+    "a later schema": ({"schema_version": SCHEMA_VERSION + 1}, "upgrade iflow-gym"),
+    "schema 0": ({"schema_version": 0}, "schema version is 0"),
+    "schema in words": ({"schema_version": "1"}, "schema version is '1'"),
+    "another method": ({"method": "another"}, "got 'another'"),
+    "an unknown setting": ({"config": {"no_such_setting": 1}}, "no_such_setting"),
+    "no config": ({"config": None}, "config of settings by name, got None"),
+    "a list of settings": ({"config": [1, 2]}, r"config of settings by name, got \[1, 2\]"),
+    "another dimension": ({"n_dims": 3}, r"goal of shape \(3,\), got \(2,\)"),
+    "a huge dimension": ({"n_dims": 10**30}, r"\), got \(2,\)"),
+    "no dimension": ({"n_dims": 0}, "n_dims to be a whole number >= 1, got 0"),
+    "a fraction of a dimension": ({"n_dims": 2.0}, "n_dims to be a whole number >= 1, got 2.0"),
+    "a dimension that is true": ({"n_dims": True}, "n_dims to be a whole number >= 1, got True"),
+    "an endless dimension": ({"n_dims": np.inf}, "n_dims to be a whole number >= 1, got inf"),
+}
+
+
 @every_method
-def test_files_of_another_version_method_or_setting_are_refused(name, model):
-    kept = model.read_bytes()
-    for changes, message in (
-        ({"schema_version": SCHEMA_VERSION + 1}, "upgrade iflow-gym"),
-        ({"method": "another"}, "got 'another'"),
-        ({"config": {"no_such_setting": 1}}, "no whole"),
-        ({"n_dims": 3}, "no whole"),
-    ):
-        model.write_bytes(kept)
-        rewritten(model, **changes)
-        with pytest.raises(ModelFileError, match=message):
+@pytest.mark.parametrize(("changes", "message"), HEADERS.values(), ids=HEADERS.keys())
+def test_a_tampered_header_is_refused(name, model, changes, message):
+    rewritten(model, **changes)
+    with pytest.raises(ModelFileError, match=message):
+        load_method(name).load(model)
+
+
+@every_method
+@pytest.mark.parametrize("text", ["[1, 2]", "3", "null", "{}", "[" * 100_000, "{"])
+def test_a_header_that_is_none_is_refused(name, model, text):
+    safetensors.numpy.save_file(read_model_file(model)[1], model, metadata={"iflow_gym": text})
+    with pytest.raises(ModelFileError, match="something else"):
+        load_method(name).load(model)
+
+
+def each(change):
+    """Change one array after another, the goal too."""
+    return lambda arrays: [{**arrays, k: change(a)} for k, a in arrays.items()]
+
+
+ARRAYS = {
+    "one missing": lambda arrays: [{k: arrays[k] for k in set(arrays) - {out}} for out in arrays],
+    "one more": lambda arrays: [{**arrays, "extra": np.zeros(3)}],
+    "NaN": each(lambda a: np.where(np.arange(a.size).reshape(a.shape) == 0, np.nan, a)),
+    "infinite": each(lambda a: np.full_like(a, np.inf)),
+    "complex": each(lambda a: a.astype(np.complex64)),
+    "whole numbers": each(lambda a: a.astype(np.int64)),
+    "flat": each(lambda a: a.reshape(1, -1)[..., None]),
+    "empty": each(lambda a: a[:0]),
+    "twice as long": each(lambda a: np.concatenate([a, a])),
+    "a single number": each(lambda a: np.array(1.0)),
+}
+
+
+@every_method
+@pytest.mark.parametrize("change", ARRAYS.values(), ids=ARRAYS.keys())
+def test_tampered_arrays_are_refused(name, model, change):
+    for arrays in change(read_model_file(model)[1]):
+        model.unlink()
+        fitted(name).save(model)
+        rewritten(model, arrays=lambda _, arrays=arrays: arrays)
+        with pytest.raises(ModelFileError, match=r"[Ee]xpected .*(got|none)"):
             load_method(name).load(model)
 
 
 @every_method
-def test_files_with_other_arrays_are_refused(name, model):
-    kept = model.read_bytes()
-    names = sorted(set(read_model_file(model)[1]) - {"goal"})
-
-    def without(arrays):
-        return {k: v for k, v in arrays.items() if k != names[0]}
-
-    def with_nan(arrays):
-        return {**arrays, "goal": np.array([np.nan, 0.0])}
-
-    for change in (without, with_nan):
-        model.write_bytes(kept)
-        rewritten(model, arrays=change)
-        with pytest.raises(ModelFileError):
-            load_method(name).load(model)
+def test_absurd_numbers_are_refused_or_harmless(name, model):
+    """Finite, of the right shape, and far beyond anything: an error of ours, or a system."""
+    _, whole = read_model_file(model)
+    for key in whole:
+        for factor in (0.0, -1.0, 1e-300, 1e300):
+            changed = np.clip(whole[key] * factor, -1e308, 1e308)
+            rewritten(model, arrays=lambda a, k=key, new=changed: {**a, k: new})
+            with contextlib.suppress(ModelFileError):
+                assert load_method(name).load(model).n_parameters > 0
+            fitted(name).save(model)
