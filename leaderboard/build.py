@@ -1,7 +1,7 @@
 """Build the leaderboard: read the records of a folder of results, write tables and figures.
 
     python leaderboard/build.py
-    python leaderboard/build.py --results results/smoke --output /tmp/leaderboard
+    python leaderboard/build.py --results results/smoke --output results/smoke-board
 
 Exit status: 0 when it is written, 2 when there is nothing to build it of.
 """
