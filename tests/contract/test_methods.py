@@ -318,7 +318,7 @@ def test_a_rollout_is_repeated_steps_from_its_start(name):
 def test_a_guarantee_is_one_of_four_and_has_a_reason():
     for kind in ("proved", "verified", "sampled", "none"):
         assert Guarantee(kind, "it is so").kind == kind
-    with pytest.raises(ValueError, match="proved, verified, sampled, none, got 'certainly'"):
+    with pytest.raises(ValueError, match="none, sampled, verified, proved, got 'certainly'"):
         Guarantee("certainly", "it is so")
     for reason in ("", "  ", None):
         with pytest.raises(ValueError, match="Expected the reason"):
