@@ -21,7 +21,8 @@ objectives are those of `ImitationFlowConfig.objective`:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -171,8 +172,29 @@ def train(
 ) -> BatchedModel:
     """Train one model for each motion (all with as many recordings and dimensions) and generator.
 
-    Returns the models on the CPU; raises `TrainingError` if one is not finite.
+    Returns the models on the CPU; raises `TrainingError` if one is not finite. On a CPU training
+    takes one thread: its tensors are small, and threads that wait for each other made a fit ten
+    times as slow on a busy machine.
     """
+    with _one_thread():
+        return _train(config, motions, rngs)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(n_threads)
+
+
+def _train(
+    config: ImitationFlowConfig,
+    motions: Sequence[Demonstrations],
+    rngs: Sequence[np.random.Generator],
+) -> BatchedModel:
     device = torch.device(
         ("cuda" if torch.cuda.is_available() else "cpu")
         if config.device == "auto"
