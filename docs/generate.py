@@ -81,6 +81,11 @@ with a policy's commands, each held for one dt; a system's own integration is ne
 `generalisation` fits on the first four of LASA's seven and scores the other three. A rollout has
 its recording's start, dt and number of samples.
 
+**Stability** is seen from a fixed grid of 16 x 16 starts (7 x 7 x 7 in space) on the recordings'
+box enlarged by half of each side at every end, over five times the longest recording, and from the
+recordings' starts with a push of 25 % of the box's diagonal at 40 % of the way. Converged means
+within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
+
 **Guarantees.** `proved`: by construction, for every state. `verified`: checked on a bounded region
 with an error bound. `sampled`: seen to hold where it was tried. `none`. Each method states its own,
 with the reason.

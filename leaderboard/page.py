@@ -481,7 +481,7 @@ def _commands(results: Sequence[Result]) -> list[str]:
     known = {*METHODS, *REFERENCES}
     foreign = sorted({r.target or r.method for r in results if r.method not in known})
     lines = [
-        f"$ python baselines/run_all.py --preset {preset} --output leaderboard/results"
+        f"$ python baselines/run_all.py --preset {preset} --force"
         for preset in sorted({r.preset for r in results})
     ]
     if foreign:
