@@ -29,7 +29,7 @@ def environments() -> str:
 ![A frame: stream lines of a policy, the recordings, the mass](images/environment.png)
 
 *`gym.make("iflow/LASA-Sshape-v0", policy=system, render_mode="rgb_array")`: the stream lines of
-`system`, brighter where it is faster, the recordings, and the mass on its way.*
+`system`, deeper where it is faster, the recordings, and the mass on its way.*
 
 `import iflow_gym` registers the environments. `"iflow_gym:iflow/LASA-Angle-v0"` imports it by
 itself, in another process for instance. Rendering needs no OpenGL.
