@@ -20,6 +20,7 @@ class Reference(Protocol):
 
     name: ClassVar[str]
     title: ClassVar[str]
+    uses_time: ClassVar[bool]
 
     def evaluate(self, env: Any, *, seed: int, protocol: str) -> Evaluation:
         """Score the row on an unwrapped environment."""
@@ -36,6 +37,7 @@ class NearestDemonstration:
 
     name: ClassVar[str] = "nearest-demonstration"
     title: ClassVar[str] = "Nearest demonstration"
+    uses_time: ClassVar[bool] = False
 
     def evaluate(self, env: Any, *, seed: int, protocol: str) -> Evaluation:
         """Score the demonstrations against each other; there is nothing random in it."""
@@ -93,6 +95,7 @@ class Replay:
 
     name: ClassVar[str] = "replay"
     title: ClassVar[str] = "Replay"
+    uses_time: ClassVar[bool] = True
 
     def evaluate(self, env: Any, *, seed: int, protocol: str) -> Evaluation:
         """Score the replay as any other policy."""

@@ -11,7 +11,8 @@ import inspect
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from iflow_gym.system import DynamicalSystem
+from iflow_gym.primitive import MovementPrimitive
+from iflow_gym.system import DynamicalSystem, Method
 
 if TYPE_CHECKING:
     from iflow_gym.baselines.references import Reference
@@ -21,7 +22,10 @@ METHODS = {
     "linear": "iflow_gym.baselines.linear:StableLinear",
     "gmr": "iflow_gym.baselines.gmr:GMR",
 }
-"""Name to ``module:Class`` of every method, a `DynamicalSystem` whose `name` is the key."""
+"""Name to ``module:Class`` of every method, a `Method` whose `name` is the key."""
+
+KINDS = (DynamicalSystem, MovementPrimitive)
+"""What a method is one of."""
 
 REFERENCES = {
     "nearest-demonstration": "iflow_gym.baselines.references:NearestDemonstration",
@@ -34,19 +38,20 @@ class UnknownNameError(ValueError):
     """A name that was asked for is none, or is not what it should be."""
 
 
-def load_method(name: str) -> type[DynamicalSystem]:
+def load_method(name: str) -> type[Method]:
     """Return the class of a registered method, or of any ``"module:Class"``.
 
     Raises
     ------
     UnknownNameError
         If there is none, with the nearest names; if the module or the class is missing; or if the
-        class is no `DynamicalSystem`, or an abstract one.
+        class is no `DynamicalSystem` or `MovementPrimitive`, or an abstract one.
     """
     loaded = load_class(name, METHODS)
-    if not (inspect.isclass(loaded) and issubclass(loaded, DynamicalSystem)):
+    if not (inspect.isclass(loaded) and issubclass(loaded, KINDS)):
         raise UnknownNameError(
-            f"Expected {name} to be a subclass of iflow_gym.system.DynamicalSystem, got {loaded!r}."
+            f"Expected {name} to be a subclass of iflow_gym.system.DynamicalSystem or of "
+            f"iflow_gym.primitive.MovementPrimitive, got {loaded!r}."
         )
     if missing := sorted(getattr(loaded, "__abstractmethods__", ())):
         raise UnknownNameError(f"Expected {name} to implement {missing}, got an abstract class.")

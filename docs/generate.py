@@ -125,7 +125,8 @@ def results() -> str:
             cells = f"{len(good)} of {len(of_method)}"
             shown = [f"{m:.3g}" for m in means]
             shown[3] = f"{100 * means[3]:.3g} %"
-            line = " | ".join([good[0].title, ", ".join(sorted(kinds)), *shown, cells])
+            title = f"{good[0].title} (uses time)" if good[0].uses_time else good[0].title
+            line = " | ".join([title, ", ".join(sorted(kinds)), *shown, cells])
             rows.append((means[1], f"| {line} |"))
         head = " | ".join(["", "guarantee", *columns.values(), "cells"])
         rule = " | ".join(["---"] * 2 + ["---:"] * (len(columns) + 1))

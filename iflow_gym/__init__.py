@@ -17,7 +17,8 @@ from iflow_gym.registration import register_all
 
 if TYPE_CHECKING:
     from iflow_gym.datasets.lasa import load_lasa
-    from iflow_gym.policy import DynamicalSystemPolicy
+    from iflow_gym.policy import DynamicalSystemPolicy, MovementPrimitivePolicy
+    from iflow_gym.primitive import MovementPrimitive
     from iflow_gym.system import DynamicalSystem
 
 __version__ = "0.1.0"
@@ -26,6 +27,8 @@ __all__ = [
     "Demonstrations",
     "DynamicalSystem",
     "DynamicalSystemPolicy",
+    "MovementPrimitive",
+    "MovementPrimitivePolicy",
     "__version__",
     "load_lasa",
 ]
@@ -33,6 +36,8 @@ __all__ = [
 _LAZY = {
     "DynamicalSystem": "iflow_gym.system",
     "DynamicalSystemPolicy": "iflow_gym.policy",
+    "MovementPrimitive": "iflow_gym.primitive",
+    "MovementPrimitivePolicy": "iflow_gym.policy",
     "load_lasa": "iflow_gym.datasets.lasa",
 }
 """Names that are imported when they are first asked for, to keep `import iflow_gym` fast."""

@@ -27,8 +27,8 @@ from iflow_gym.demonstrations import BoundingBox, Demonstrations, FloatArray
 from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
 from iflow_gym.envs.task import THINNEST_SIDE, PointMassInterface, Push
 from iflow_gym.metrics.stability import PERTURBATION_SIZE, PERTURBATION_TIME, STARTS_PER_AXIS
-from iflow_gym.policy import DynamicalSystemPolicy
-from iflow_gym.system import DynamicalSystem
+from iflow_gym.policy import MethodPolicy, policy_of
+from iflow_gym.system import DynamicalSystem, Method
 
 TRANSITIONS = (1, 10)
 """Samples k between the two ends of a transition whose likelihood is taken."""
@@ -101,11 +101,12 @@ def evaluate(
 
     Parameters
     ----------
-    system_or_policy : DynamicalSystem or Policy
+    system_or_policy : DynamicalSystem, MovementPrimitive or Policy
         Fitted on the protocol's fit split. Anything with `predict(observation, state,
         episode_start, deterministic)` will do, a policy that depends on time too: what it returns
         as its state is given back at the next step (None at the first). Only a system has
-        teacher-forced metrics, a likelihood and a Lyapunov function.
+        teacher-forced metrics, a likelihood and a Lyapunov function: of a primitive, which has no
+        field to be asked, they are None. Its pushed rollouts show what its clock does then.
     env : environment, vector environment or str
         One of iflow_gym's, or an id. It is not stepped: batches with its demonstrations and its
         control mode are made for the purpose, without its perturbation, horizon or wrappers.
@@ -136,8 +137,9 @@ def evaluate(
     dt), each at its own demonstration's dt: at least 5 times its own duration.
     """
     task = _task_environment(env)
-    system = _system_of(system_or_policy)
-    policy = system_or_policy if system is None else system
+    method = _method_of(system_or_policy)
+    system = method if isinstance(method, DynamicalSystem) else None
+    policy = system_or_policy if method is None else method
     demos = task.demonstrations
     scored = demos.split(protocol).score
     indices = [i for i, p in enumerate(demos.positions) if any(p is q for q in scored.positions)]
@@ -156,7 +158,8 @@ def evaluate(
         per_demonstration["perturbation_recovery"] = recovered
     if system is not None:
         values["lyapunov_violation"] = _lyapunov_violation(system, demos, state_rng)
-        values["n_parameters"] = float(system.n_parameters)
+    if method is not None:
+        values["n_parameters"] = float(method.n_parameters)
     values["step_us"] = _step_us(policy, task, scored)
     values |= {name: _statistic(np.mean, v) for name, v in per_demonstration.items()}
     medians = {name: _statistic(np.median, v) for name, v in per_demonstration.items()}
@@ -175,16 +178,16 @@ def _task_environment(env: Any) -> PointMassInterface:
     return base
 
 
-def _system_of(system_or_policy: Any) -> DynamicalSystem | None:
-    if isinstance(system_or_policy, DynamicalSystem):
+def _method_of(system_or_policy: Any) -> Method | None:
+    if isinstance(system_or_policy, Method):
         return system_or_policy
-    if isinstance(system_or_policy, DynamicalSystemPolicy):
-        return system_or_policy.system  # its own environment is another than the batch
+    if isinstance(system_or_policy, MethodPolicy):
+        return system_or_policy.method  # its own environment is another than the batch
     if not callable(getattr(system_or_policy, "predict", None)) and not hasattr(
         system_or_policy, "for_environment"
     ):
         raise TypeError(
-            "Expected a fitted DynamicalSystem or a policy with predict(observation, state, "
+            "Expected a fitted method or a policy with predict(observation, state, "
             f"episode_start, deterministic), got {type(system_or_policy).__name__}."
         )
     return None
@@ -192,8 +195,8 @@ def _system_of(system_or_policy: Any) -> DynamicalSystem | None:
 
 def _bound(policy: Any, env: Any) -> Policy:
     """Return the policy for an environment."""
-    if isinstance(policy, DynamicalSystem):
-        return DynamicalSystemPolicy(policy, env)
+    if isinstance(policy, Method):
+        return policy_of(policy, env)
     bind: Callable[[Any], Policy] | None = getattr(policy, "for_environment", None)
     bound: Policy = policy if bind is None else bind(env)
     return bound
@@ -443,7 +446,10 @@ def _scored_box(demos: Demonstrations) -> BoundingBox:
 
 
 def _step_us(policy: Any, task: PointMassInterface, scored: Demonstrations) -> float:
-    """Return the median time of a call with a single state, along the first demonstration."""
+    """Return the median time of a call with a single state, along the first demonstration.
+
+    A policy's own state goes from call to call, as in an episode.
+    """
     from iflow_gym.envs.point_mass import PointMassEnv
 
     settings: dict[str, Any] = {"control_mode": task.control_mode}
@@ -456,10 +462,14 @@ def _step_us(policy: Any, task: PointMassInterface, scored: Demonstrations) -> f
     if task.control_mode == "force":
         states = np.hstack([states, np.zeros_like(states)])
     following = cycle(list(states))
+    state: Any = None
+
+    def call() -> None:
+        nonlocal state
+        _, state = bound.predict(next(following), state=state, deterministic=True)
+
     with one_thread():
-        return metrics.median_call_us(
-            lambda: bound.predict(next(following), deterministic=True), TIMED_CALLS
-        )
+        return metrics.median_call_us(call, TIMED_CALLS)
 
 
 @contextmanager

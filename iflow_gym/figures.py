@@ -39,12 +39,20 @@ PALETTE = (
     "#56b4e9",  # sky
     "#806000",  # brown, for yellow, which is too pale for points on white
     "#4d4d4d",  # grey
+    "#882255",  # wine
+    "#44aa99",  # teal
+    "#332288",  # indigo
+    "#999933",  # olive
 )
-"""Okabe and Ito's colours, which colour-blind readers can tell apart."""
+"""Okabe and Ito's colours, which colour-blind readers can tell apart, and four of Tol's for more
+methods than they are."""
 
 REFERENCE_COLOUR = "#8a8578"
 
-MARKERS = {"proved": "o", "verified": "s", "sampled": "^", "none": "X"}
+USES_TIME = "none, uses time"
+"""What a method that follows a clock has in place of a kind of guarantee."""
+
+MARKERS = {"proved": "o", "verified": "s", "sampled": "^", "none": "X", USES_TIME: "D"}
 """Marker of each kind of guarantee."""
 
 KEPT_COLOURS = (GOAL, INK, DEMONSTRATION, ROLLOUT, PAPER, "white", *PALETTE)
@@ -77,7 +85,7 @@ def method_styles(
         Name to title and kind of guarantee.
     order
         Names that keep their colours whichever methods are there: the registry's. Others follow,
-        sorted by name; beyond eight colours repeat.
+        sorted by name; beyond the palette's colours repeat.
     """
     names = [*order, *sorted(set(methods) - set(order))]
     colours = dict(zip(names, itertools.cycle(PALETTE), strict=False))

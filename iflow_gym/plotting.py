@@ -185,7 +185,7 @@ def plot_field(
     ----------
     ax : matplotlib Axes
     system : DynamicalSystem or None
-        Anything with `velocity`; None leaves the streamlines out.
+        Anything with `velocity`; what has none, and None, leaves the streamlines out.
     demonstrations : Demonstrations
         Planar.
     rollouts : iterable of arrays, shape (T, 2), optional
@@ -193,11 +193,12 @@ def plot_field(
         Scale of the drawing; a panel of many needs less of both.
     """
     frame_axes(ax, demonstrations)
-    if system is not None:
+    field: Field | None = getattr(system, "velocity", None)
+    if field is not None:
         low, high = view(demonstrations)
         plot_streamlines(
             ax,
-            system.velocity,
+            field,
             low,
             high,
             density=density,

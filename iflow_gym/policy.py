@@ -1,4 +1,4 @@
-"""A DynamicalSystem as a policy, with the interface of Stable-Baselines3's models."""
+"""A fitted method as a policy, with the interface of Stable-Baselines3's models."""
 
 from __future__ import annotations
 
@@ -8,13 +8,97 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iflow_gym.demonstrations import FloatArray
-from iflow_gym.system import DynamicalSystem
+from iflow_gym.primitive import MovementPrimitive, PhaseState, start_again
+from iflow_gym.system import DynamicalSystem, Method
 
 BISECTIONS = 30
 """At most so many halvings of the time fraction: it is found to 1e-9."""
 
 
-class DynamicalSystemPolicy:
+class MethodPolicy:
+    """What the policies of both kinds of method have in common: an environment, or its numbers.
+
+    Parameters
+    ----------
+    method : Method
+        Fitted.
+    env : an environment or vector environment of iflow_gym, optional
+        Its `unwrapped.dt` is read at every call, since each episode has its demonstration's.
+    max_speed : float, length/s, and dt : float, seconds
+        In place of `env`: the action is then the command as a fraction of `max_speed`.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        env: Any = None,
+        *,
+        max_speed: float | None = None,
+        dt: float | None = None,
+    ) -> None:
+        n_dims = getattr(method, "n_dims_", None)
+        if n_dims is None:
+            raise ValueError(
+                f"Expected a fitted system, got {type(method).__name__}: call "
+                "fit(demonstrations, seed=0) first."
+            )
+        self.method = method
+        self._n_dims = int(n_dims)
+        self._env: Any = None
+        self._dt = 0.0
+        if env is None:
+            if max_speed is None or dt is None:
+                raise TypeError("Expected an environment, or both max_speed and dt.")
+            if not (max_speed > 0 and dt > 0):
+                raise ValueError(f"Expected max_speed > 0 and dt > 0, got {max_speed} and {dt}.")
+            self.max_speed, self._dt = float(max_speed), float(dt)
+            return
+        if max_speed is not None or dt is not None:
+            raise TypeError("Expected an environment, or max_speed and dt, got both.")
+        self._env = env.unwrapped
+        if not hasattr(self._env, "command_to_action"):
+            raise TypeError(
+                "Expected an environment of iflow_gym, or a batch from gymnasium.make_vec(id, "
+                f"num_envs=n), got {type(self._env).__name__}: it has no command_to_action. Give "
+                "max_speed and dt in its place."
+            )
+        if self._env.n_dims != self._n_dims:
+            raise ValueError(
+                f"Expected a system of {self._env.n_dims} dimensions as the environment has, got "
+                f"{self._n_dims}."
+            )
+        self.max_speed = float(self._env.max_speed)
+
+    @property
+    def dt(self) -> Any:
+        """Seconds a step: the environment's at this moment, a float or shape (n,)."""
+        return self._dt if self._env is None else self._env.dt
+
+    def _checked(self, observation: ArrayLike) -> tuple[FloatArray, Any]:
+        """Return observations, shape (..., observation), and their dt; the position comes first."""
+        values = np.asarray(observation, dtype=np.float64)
+        width = self._n_dims if self._env is None else self._env.observation_space.shape[-1]
+        if values.ndim == 0 or values.shape[-1] != width:
+            raise ValueError(f"Expected observations of shape (..., {width}), got {values.shape}.")
+        dt = self.dt
+        if np.ndim(dt) and np.shape(dt) != values.shape[:-1]:
+            raise ValueError(
+                f"Expected observations of all {len(dt)} environments, got shape {values.shape}: "
+                "each environment has its own dt."
+            )
+        return values, dt
+
+    def _action(self, command: FloatArray, observation: FloatArray, dt: Any) -> FloatArray:
+        """Return the action, shape (..., d), for a velocity command, shape (..., d)."""
+        if self._env is None:
+            action = command / self.max_speed
+            scaled: FloatArray = action / np.maximum(_largest(np.abs(action)), 1.0)[..., None]
+            return scaled
+        converted: FloatArray = self._env.command_to_action(command, observation, dt)
+        return converted
+
+
+class DynamicalSystemPolicy(MethodPolicy):
     """Runs a dynamical system in an environment.
 
     The command in state x is the mean velocity of the system's own step,
@@ -59,43 +143,8 @@ class DynamicalSystemPolicy:
         max_speed: float | None = None,
         dt: float | None = None,
     ) -> None:
-        n_dims = getattr(system, "n_dims_", None)
-        if n_dims is None:
-            raise ValueError(
-                f"Expected a fitted system, got {type(system).__name__}: call "
-                "fit(demonstrations, seed=0) first."
-            )
+        super().__init__(system, env, max_speed=max_speed, dt=dt)
         self.system = system
-        self._n_dims = int(n_dims)
-        self._env: Any = None
-        self._dt = 0.0
-        if env is None:
-            if max_speed is None or dt is None:
-                raise TypeError("Expected an environment, or both max_speed and dt.")
-            if not (max_speed > 0 and dt > 0):
-                raise ValueError(f"Expected max_speed > 0 and dt > 0, got {max_speed} and {dt}.")
-            self.max_speed, self._dt = float(max_speed), float(dt)
-            return
-        if max_speed is not None or dt is not None:
-            raise TypeError("Expected an environment, or max_speed and dt, got both.")
-        self._env = env.unwrapped
-        if not hasattr(self._env, "command_to_action"):
-            raise TypeError(
-                "Expected an environment of iflow_gym, or a batch from gymnasium.make_vec(id, "
-                f"num_envs=n), got {type(self._env).__name__}: it has no command_to_action. Give "
-                "max_speed and dt in its place."
-            )
-        if self._env.n_dims != self._n_dims:
-            raise ValueError(
-                f"Expected a system of {self._env.n_dims} dimensions as the environment has, got "
-                f"{self._n_dims}."
-            )
-        self.max_speed = float(self._env.max_speed)
-
-    @property
-    def dt(self) -> Any:
-        """Seconds a step: the environment's at this moment, a float or shape (n,)."""
-        return self._dt if self._env is None else self._env.dt
 
     def velocity(self, x: ArrayLike) -> FloatArray:
         """Return the system's velocity, shape (..., d): what a picture of the policy shows."""
@@ -151,22 +200,87 @@ class DynamicalSystemPolicy:
         state, episode_start, deterministic
             Stable-Baselines3's arguments; the policy has no memory and no noise.
         """
-        values = np.asarray(observation, dtype=np.float64)
-        width = self._n_dims if self._env is None else self._env.observation_space.shape[-1]
-        if values.ndim == 0 or values.shape[-1] != width:
-            raise ValueError(f"Expected observations of shape (..., {width}), got {values.shape}.")
-        dt = self.dt
-        if np.ndim(dt) and np.shape(dt) != values.shape[:-1]:
-            raise ValueError(
-                f"Expected observations of all {len(dt)} environments, got shape {values.shape}: "
-                "each environment has its own dt."
-            )
+        values, dt = self._checked(observation)
         command = self.command(values[..., : self._n_dims], dt)
-        if self._env is None:
-            action = command / self.max_speed
-            return action / np.maximum(_largest(np.abs(action)), 1.0)[..., None], state
-        action = self._env.command_to_action(command, values, dt)
-        return action, state
+        return self._action(command, values, dt), state
+
+
+class MovementPrimitivePolicy(MethodPolicy):
+    """Runs a movement primitive in an environment; its state is the primitive's clock.
+
+    The command at x is the mean velocity to where the primitive wants to be, (x_next - x) / dt,
+    which the environment holds for one dt. Where a component of it exceeds the greatest speed the
+    command is scaled down, and the clock runs on: the mass then lags, and catches up later.
+
+    Give the state that `predict` returns back to the next call. Without one, and where
+    `episode_start` is true, the clock starts anew at the observation.
+
+    Parameters
+    ----------
+    primitive : MovementPrimitive
+        Fitted.
+    env, max_speed, dt
+        As for `DynamicalSystemPolicy`.
+
+    Examples
+    --------
+    >>> policy = MovementPrimitivePolicy(primitive, env)  # doctest: +SKIP
+    >>> state = None  # doctest: +SKIP
+    >>> action, state = policy.predict(observation, state)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        primitive: MovementPrimitive,
+        env: Any = None,
+        *,
+        max_speed: float | None = None,
+        dt: float | None = None,
+    ) -> None:
+        super().__init__(primitive, env, max_speed=max_speed, dt=dt)
+        self.primitive = primitive
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: PhaseState | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[FloatArray, PhaseState]:
+        """Return actions in [-1, 1], float64, and the state for the next step.
+
+        Parameters
+        ----------
+        observation : array, shape (d,) or (n, d); in force mode 2 d
+            The position comes first.
+        state : dict or None
+            What the last call returned; None starts the clock.
+        episode_start : array of bool, shape (n,), optional
+            Where an episode begins, and the clock with it.
+        deterministic
+            Stable-Baselines3's argument; the policy has no noise.
+        """
+        values, dt = self._checked(observation)
+        x = values[..., : self._n_dims]
+        if state is None:
+            state = self.primitive.begin(x)
+        elif episode_start is not None and np.any(begun := np.asarray(episode_start, dtype=bool)):
+            again = np.broadcast_to(begun.reshape(-1), state["phase"].shape)
+            state = start_again(state, self.primitive.begin(x), again)
+        following, state = self.primitive.advance(x, state, dt)
+        command = (following - x) / np.asarray(dt, dtype=np.float64)[..., None]
+        return self._action(command, values, dt), state
+
+
+def policy_of(method: Method, env: Any) -> DynamicalSystemPolicy | MovementPrimitivePolicy:
+    """Return the policy that runs a fitted method, whichever its kind is, in an environment."""
+    if isinstance(method, DynamicalSystem):
+        return DynamicalSystemPolicy(method, env)
+    if isinstance(method, MovementPrimitive):
+        return MovementPrimitivePolicy(method, env)
+    raise TypeError(
+        f"Expected a DynamicalSystem or a MovementPrimitive, got {type(method).__name__}."
+    )
 
 
 def _largest(vectors: FloatArray) -> FloatArray:

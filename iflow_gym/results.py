@@ -68,6 +68,8 @@ class Result:
     """Why there are no scores; None where there are."""
     reference: bool = False
     """Whether the row is a reference that does not compete."""
+    uses_time: bool = False
+    """Whether the method follows a clock: it has no field, and does not compete with those."""
     metrics: dict[str, float | None] = field(default_factory=dict)
     """Every metric of `iflow_gym.metrics.METRICS` by name, where one has a value for each scored
     demonstration their mean; None where it does not apply. Empty for a failed cell."""
@@ -211,6 +213,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
             f"{file} has schema version {version}, this package reads up to {SCHEMA_VERSION}: "
             "upgrade iflow-gym."
         )
+    values.setdefault("uses_time", False)  # records from before there were such methods lack it
     known = {f.name for f in dataclasses.fields(Result)}
     if known != set(values):
         raise ResultFileError(

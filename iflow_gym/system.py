@@ -1,8 +1,10 @@
-"""DynamicalSystem: the contract that every method keeps.
+"""Method and DynamicalSystem: the contract that every method keeps.
 
-A method learns an autonomous system dx/dt = f(x) from demonstrations. It implements `_fit` and
-`_velocity` (and `_step` where it has a closed form), its parameters as arrays for files, and
-states its guarantee. Shapes are checked here, once, so that methods need not.
+A method learns a motion from demonstrations. It implements `_fit`, gives its parameters as arrays
+for files, and states its guarantee. A `DynamicalSystem` learns an autonomous system dx/dt = f(x)
+and implements `_velocity` too (and `_step` where it has a closed form); the other kind of method,
+which uses time, is `iflow_gym.primitive.MovementPrimitive`. Shapes are checked here, once, so that
+methods need not.
 """
 
 from __future__ import annotations
@@ -54,18 +56,22 @@ class Guarantee:
 
 
 class NotFittedError(RuntimeError):
-    """A system was asked for its field before `fit`."""
+    """A method was asked for what it has learned before `fit`."""
 
 
-class DynamicalSystem(ABC):
-    """An autonomous dynamical system dx/dt = f(x) that is learned from demonstrations.
+class Method(ABC):
+    """Something that learns a motion from demonstrations: settings, fitting, files, guarantee.
+
+    Methods derive from one of its kinds, `DynamicalSystem` or `MovementPrimitive`.
 
     Attributes
     ----------
     n_dims_ : int
         Dimension d of the state, set by `fit`.
     goal_ : array, shape (d,)
-        The demonstrations' goal, set by `fit`.
+        The demonstrations' goal, set by `fit`; of a motion that repeats, the mean of its samples.
+    period_ : float or None
+        Seconds a round, set by `fit`; None for a motion that ends.
     """
 
     name: ClassVar[str]
@@ -77,7 +83,11 @@ class DynamicalSystem(ABC):
     stochastic_fit: ClassVar[bool] = True
     """Whether the seed changes the fit."""
     integrator: ClassVar[str] = "explicit Euler"
-    """How `step` integrates: recorded with every score."""
+    """How the next state is found: recorded with every score."""
+    uses_time: ClassVar[bool] = False
+    """Whether a command depends on the time since the start, and not on the state alone."""
+    learns_cycles: ClassVar[bool] = False
+    """Whether `fit` takes demonstrations that repeat with a period, too."""
 
     def __init__(self, config: Any = None, **settings: Any) -> None:
         """Store the settings: a `Config`, or its fields by name, or both (names win)."""
@@ -104,7 +114,7 @@ class DynamicalSystem(ABC):
     def fit_many(
         self, demonstrations: Sequence[Demonstrations], *, seeds: Sequence[int]
     ) -> list[Self]:
-        """Learn one system for each entry of `demonstrations`, with the seed beside it.
+        """Learn one motion for each entry of `demonstrations`, with the seed beside it.
 
         Methods that train faster together override `_fit_many`; the default is a loop.
         """
@@ -130,7 +140,7 @@ class DynamicalSystem(ABC):
                 f"Expected Demonstrations, got {type(demonstrations).__name__}: make them with "
                 "Demonstrations.from_arrays(...)."
             )
-        if demonstrations.goal is None:
+        if demonstrations.goal is None and not self.learns_cycles:
             raise ValueError(
                 f"{self.title} learns motions that end at a goal, got {demonstrations.name!r}, "
                 f"which repeats with a period of {demonstrations.period} s."
@@ -138,12 +148,115 @@ class DynamicalSystem(ABC):
 
     def _fitted(self, demonstrations: Demonstrations) -> Self:
         self.n_dims_ = demonstrations.n_dims
-        self.goal_ = demonstrations.attractor
+        self.period_ = demonstrations.period
+        self.goal_ = (
+            np.concatenate(demonstrations.positions).mean(axis=0)
+            if demonstrations.goal is None
+            else demonstrations.goal
+        )
         return self
 
     @abstractmethod
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
         """Learn from demonstrations; every random number comes from `rng`."""
+
+    @property
+    @abstractmethod
+    def guarantee(self) -> Guarantee:
+        """What is known about the stability of what was fitted, and why."""
+
+    @property
+    def n_parameters(self) -> int:
+        """How many numbers describe what was fitted."""
+        self._require_fit()
+        return sum(a.size for a in self._arrays().values())
+
+    def _require_fit(self) -> None:
+        if not hasattr(self, "n_dims_"):
+            raise NotFittedError(
+                f"{type(self).__name__} has not been fitted: call fit(demonstrations, seed=0)."
+            )
+
+    def _states(self, x: ArrayLike) -> tuple[FloatArray, tuple[int, ...]]:
+        self._require_fit()
+        states = np.asarray(x, dtype=np.float64)
+        if states.ndim == 0 or states.shape[-1] != self.n_dims_:
+            raise ValueError(f"Expected states of shape (..., {self.n_dims_}), got {states.shape}.")
+        return states.reshape(-1, self.n_dims_), states.shape
+
+    # Files --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Return the fitted parameters by name, real floating and finite: what a file holds."""
+
+    @abstractmethod
+    def _restore(self, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take the fitted parameters back; raise KeyError or ValueError if they do not fit.
+
+        `config`, `n_dims_`, `goal_` and `period_` are set. A file may come from anywhere: the
+        numbers that the guarantee rests on are checked here. What `_arrays` returns afterwards are
+        the names that a file must have; other ones are refused.
+        """
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write a safetensors file whose header holds the settings as JSON; replace atomically."""
+        self._require_fit()
+        header = {
+            "schema_version": SCHEMA_VERSION,
+            "method": self.name,
+            "config": dataclasses.asdict(self.config),
+            "n_dims": self.n_dims_,
+        }
+        arrays = {k: np.ascontiguousarray(a) for k, a in self._arrays().items()}
+        arrays["goal"] = np.array(self.goal_)
+        if self.period_ is not None:
+            arrays["period"] = np.array(self.period_)
+        for key, array in arrays.items():
+            _check_numbers(key, array)
+        target = Path(path)
+        partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
+        partial.write_bytes(
+            safetensors.numpy.save(arrays, metadata={"iflow_gym": json.dumps(header)})
+        )
+        partial.replace(target)
+        return target
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file that `save` wrote; raise ModelFileError if it is anything else."""
+        header, arrays = read_model_file(path)
+        if header["method"] != cls.name:
+            raise ModelFileError(
+                f"Expected {path} to hold a {cls.name!r} model, got {header['method']!r}."
+            )
+        try:
+            config, n_dims = header["config"], header["n_dims"]
+            if not isinstance(config, dict):
+                raise ValueError(f"expected a config of settings by name, got {config!r}")
+            if type(n_dims) is not int or n_dims < 1:
+                raise ValueError(f"expected n_dims to be a whole number >= 1, got {n_dims!r}")
+            system = cls(cls.Config(**_as_tuples(config)))
+            system.n_dims_ = n_dims
+            system.goal_ = np.asarray(arrays.pop("goal"), dtype=np.float64)
+            if system.goal_.shape != (n_dims,):
+                raise ValueError(f"expected a goal of shape {(n_dims,)}, got {system.goal_.shape}")
+            system.period_ = _period(arrays.pop("period", None), cls.learns_cycles)
+            with np.errstate(all="ignore"):  # absurd numbers are told by the checks
+                system._restore(arrays)
+            if (names := sorted(system._arrays())) != sorted(arrays):
+                raise ValueError(f"expected the arrays {names}, got {sorted(arrays)}")
+        except KeyError as error:
+            raise ModelFileError(
+                f"{path} is no whole {cls.name!r} model: expected {error} in it, got none."
+            ) from error
+        except _BAD_FILE as error:
+            raise ModelFileError(f"{path} is no whole {cls.name!r} model: {error}.") from error
+        return system
+
+
+class DynamicalSystem(Method):
+    """An autonomous dynamical system dx/dt = f(x) that is learned from demonstrations."""
 
     # The field ----------------------------------------------------------------------------
 
@@ -155,7 +268,7 @@ class DynamicalSystem(ABC):
     def step(self, x: ArrayLike, dt: float | FloatArray) -> FloatArray:
         """Return the states, shape (..., d), a time dt (seconds, > 0, broadcast) after x."""
         states, shape = self._states(x)
-        return self._step(states, _steps(dt, shape[:-1])).reshape(shape)
+        return self._step(states, step_times(dt, shape[:-1])).reshape(shape)
 
     def rollout(self, x0: ArrayLike, n_steps: int, dt: float) -> FloatArray:
         """Return the trajectory from x0, shape (..., n_steps + 1, d), x0 (..., d) included.
@@ -214,97 +327,6 @@ class DynamicalSystem(ABC):
 
     def _log_prob(self, x: FloatArray, x_next: FloatArray, dt: float) -> FloatArray | None:
         return None
-
-    @property
-    @abstractmethod
-    def guarantee(self) -> Guarantee:
-        """What is known about the stability of the fitted field, and why."""
-
-    @property
-    def n_parameters(self) -> int:
-        """How many numbers describe the fitted system."""
-        self._require_fit()
-        return sum(a.size for a in self._arrays().values())
-
-    def _require_fit(self) -> None:
-        if not hasattr(self, "n_dims_"):
-            raise NotFittedError(
-                f"{type(self).__name__} has not been fitted: call fit(demonstrations, seed=0)."
-            )
-
-    def _states(self, x: ArrayLike) -> tuple[FloatArray, tuple[int, ...]]:
-        self._require_fit()
-        states = np.asarray(x, dtype=np.float64)
-        if states.ndim == 0 or states.shape[-1] != self.n_dims_:
-            raise ValueError(f"Expected states of shape (..., {self.n_dims_}), got {states.shape}.")
-        return states.reshape(-1, self.n_dims_), states.shape
-
-    # Files --------------------------------------------------------------------------------
-
-    @abstractmethod
-    def _arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Return the fitted parameters by name, real floating and finite: what a file holds."""
-
-    @abstractmethod
-    def _restore(self, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the fitted parameters back; raise KeyError or ValueError if they do not fit.
-
-        `config`, `n_dims_` and `goal_` are set. A file may come from anywhere: the numbers that the
-        guarantee rests on are checked here. What `_arrays` returns afterwards are the names that a
-        file must have; other ones are refused.
-        """
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write a safetensors file whose header holds the settings as JSON; replace atomically."""
-        self._require_fit()
-        header = {
-            "schema_version": SCHEMA_VERSION,
-            "method": self.name,
-            "config": dataclasses.asdict(self.config),
-            "n_dims": self.n_dims_,
-        }
-        arrays = {k: np.ascontiguousarray(a) for k, a in self._arrays().items()}
-        arrays["goal"] = np.array(self.goal_)
-        for key, array in arrays.items():
-            _check_numbers(key, array)
-        target = Path(path)
-        partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
-        partial.write_bytes(
-            safetensors.numpy.save(arrays, metadata={"iflow_gym": json.dumps(header)})
-        )
-        partial.replace(target)
-        return target
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file that `save` wrote; raise ModelFileError if it is anything else."""
-        header, arrays = read_model_file(path)
-        if header["method"] != cls.name:
-            raise ModelFileError(
-                f"Expected {path} to hold a {cls.name!r} model, got {header['method']!r}."
-            )
-        try:
-            config, n_dims = header["config"], header["n_dims"]
-            if not isinstance(config, dict):
-                raise ValueError(f"expected a config of settings by name, got {config!r}")
-            if type(n_dims) is not int or n_dims < 1:
-                raise ValueError(f"expected n_dims to be a whole number >= 1, got {n_dims!r}")
-            system = cls(cls.Config(**_as_tuples(config)))
-            system.n_dims_ = n_dims
-            system.goal_ = np.asarray(arrays.pop("goal"), dtype=np.float64)
-            if system.goal_.shape != (n_dims,):
-                raise ValueError(f"expected a goal of shape {(n_dims,)}, got {system.goal_.shape}")
-            with np.errstate(all="ignore"):  # absurd numbers are told by the checks
-                system._restore(arrays)
-            if (names := sorted(system._arrays())) != sorted(arrays):
-                raise ValueError(f"expected the arrays {names}, got {sorted(arrays)}")
-        except KeyError as error:
-            raise ModelFileError(
-                f"{path} is no whole {cls.name!r} model: expected {error} in it, got none."
-            ) from error
-        except _BAD_FILE as error:
-            raise ModelFileError(f"{path} is no whole {cls.name!r} model: {error}.") from error
-        return system
 
 
 class ModelFileError(ValueError):
@@ -382,6 +404,17 @@ def check_positive_definite(matrices: np.ndarray[Any, Any], what: str) -> None:
         )
 
 
+def _period(array: np.ndarray[Any, Any] | None, learns_cycles: bool) -> float | None:
+    """Return the seconds of a round that a file holds; None where it holds none."""
+    if array is None:
+        return None
+    if not learns_cycles:
+        raise ValueError(f"expected a motion that ends, got a period of {array}")
+    if array.shape != () or not array > 0:
+        raise ValueError(f"expected one period > 0, got {array}")
+    return float(array)
+
+
 def _check_numbers(key: str, array: np.ndarray[Any, Any]) -> None:
     if array.dtype.kind != "f":
         raise ValueError(f"Expected real floating numbers in {key!r}, got {array.dtype}.")
@@ -389,7 +422,7 @@ def _check_numbers(key: str, array: np.ndarray[Any, Any]) -> None:
         raise ValueError(f"Expected finite numbers in {key!r}, got NaN or infinity.")
 
 
-def _steps(dt: float | FloatArray, shape: tuple[int, ...]) -> FloatArray:
+def step_times(dt: float | FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Return times > 0, broadcast to `shape` and flattened."""
     times = np.asarray(dt, dtype=np.float64)
     if not ((times > 0) & (times < np.inf)).all():
@@ -404,7 +437,7 @@ def _steps(dt: float | FloatArray, shape: tuple[int, ...]) -> FloatArray:
 
 def seconds(dt: float) -> float:
     """Return one finite time > 0 as a float; raise ValueError for anything else."""
-    return float(_steps(dt, ())[0])
+    return float(step_times(dt, ())[0])
 
 
 def whole_number(n_steps: SupportsIndex) -> int:

@@ -36,12 +36,19 @@ class Row:
     method: str
     title: str
     reference: bool
+    uses_time: bool
+    """Whether the method follows a clock and has no field."""
     environments: tuple[str, ...]
     """All that the family has."""
     seeds: tuple[int, ...]
     """All that the method was run with, on any environment of the board."""
     cells: Mapping[tuple[str, int], Result]
     """By environment and seed."""
+
+    @property
+    def competes(self) -> bool:
+        """Whether the row is ranked: a field that is learned from the demonstrations."""
+        return not (self.reference or self.uses_time)
 
     @property
     def n_expected(self) -> int:
@@ -113,11 +120,16 @@ class Board:
     protocol: str
     environments: tuple[str, ...]
     rows: tuple[Row, ...]
-    """Competitors by mean rank, best first; then the references by name."""
+    """Competitors by mean rank, best first; then by name those that use time, the references."""
 
     @property
     def competitors(self) -> tuple[Row, ...]:
         """Rows that are ranked."""
+        return tuple(row for row in self.rows if row.competes)
+
+    @property
+    def methods(self) -> tuple[Row, ...]:
+        """Rows that were fitted: all but the references."""
         return tuple(row for row in self.rows if not row.reference)
 
     @cached_property
@@ -126,7 +138,7 @@ class Board:
         return ranks_of(self.competitors)
 
     def best(self, values: Mapping[str, float], metric: str) -> set[str]:
-        """Return the methods whose value is the best, references left out.
+        """Return the methods whose value is the best, of those that compete.
 
         Only rows that cover as many cells as the fullest one compete: a mean over the three
         easiest environments is no better than one over all.
@@ -191,8 +203,10 @@ def _board(family: str, protocol: str, results: Sequence[Result]) -> Board:
         _row(environments, [r for r in results if r.method == method])
         for method in sorted({result.method for result in results})
     ]
-    ranks = ranks_of([row for row in rows if not row.reference])
-    rows.sort(key=lambda row: (row.reference, ranks.get(row.method, 0.0), row.method))
+    ranks = ranks_of([row for row in rows if row.competes])
+    rows.sort(
+        key=lambda row: (row.reference, row.uses_time, ranks.get(row.method, 0.0), row.method)
+    )
     return Board(family, protocol, environments, tuple(rows))
 
 
@@ -202,6 +216,7 @@ def _row(environments: tuple[str, ...], results: Sequence[Result]) -> Row:
         method=first.method,
         title=first.title,
         reference=first.reference,
+        uses_time=first.uses_time,
         environments=environments,
         seeds=tuple(sorted({result.seed for result in results})),
         cells={(result.environment, result.seed): result for result in results},

@@ -26,6 +26,7 @@ import iflow_gym  # noqa: F401 (registers the environments)
 from iflow_gym.baselines.registry import METHODS, load_method
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.figures import (
+    USES_TIME,
     FieldPanel,
     MethodStyle,
     Point,
@@ -36,7 +37,7 @@ from iflow_gym.figures import (
     scatter_figure,
 )
 from iflow_gym.results import Result, ResultFileError, read_results
-from iflow_gym.system import GUARANTEE_KINDS, DynamicalSystem
+from iflow_gym.system import GUARANTEE_KINDS, Method
 
 HERE = Path(__file__).resolve().parent
 
@@ -145,13 +146,18 @@ def draw(boards: Iterable[Board], results_folder: Path) -> dict[str, tuple[Figur
 
 
 def styles_of(board: Board) -> dict[str, MethodStyle]:
-    """Return the competitors' styles, in the board's order."""
+    """Return the methods' styles, in the board's order."""
     methods = {
-        row.method: (row.title, row.guarantees[0] if row.guarantees else GUARANTEE_KINDS[0])
-        for row in board.competitors
+        row.method: (row.title, USES_TIME if row.uses_time else weakest(row))
+        for row in board.methods
         if row.n_scored
     }
     return method_styles(methods, order=tuple(METHODS))
+
+
+def weakest(row: Row) -> str:
+    """Return the weakest kind of guarantee that a row's cells state."""
+    return row.guarantees[0] if row.guarantees else GUARANTEE_KINDS[0]
 
 
 def reference_median(board: Board, metric: str) -> float | None:
@@ -221,7 +227,7 @@ def boxes(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
 
 
 def _drawn(board: Board, styles: Mapping[str, MethodStyle]) -> list[Row]:
-    return [row for row in board.competitors if row.method in styles]
+    return [row for row in board.methods if row.method in styles]
 
 
 def _tried(row: Row, metric: str) -> list[tuple[float, bool]]:
@@ -249,7 +255,7 @@ def method_panels(board: Board, results_folder: Path) -> list[FieldPanel]:
     panels = [
         panel_of(row, environment, row.title, results_folder)
         for environment in environments
-        for row in board.competitors
+        for row in board.methods
     ]
     return [panel for panel in panels if panel is not None]
 
@@ -268,7 +274,7 @@ def panel_of(row: Row, environment: str, title: str, results_folder: Path) -> Fi
     return FieldPanel(title, demonstrations, system, problem)
 
 
-def load_model(cell: Result, results_folder: Path) -> tuple[DynamicalSystem | None, str]:
+def load_model(cell: Result, results_folder: Path) -> tuple[Method | None, str]:
     """Return the fitted model beside a record, or None, and in a few words why there is none.
 
     A method that is not in the registry is imported by the ``module:Class`` that the record names.

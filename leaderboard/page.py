@@ -266,7 +266,9 @@ def render(
         "Methods that learn a motion from demonstrations, scored on the same ground. Lower is "
         "better, but for *converged* and *recovery*. **Bold** is the best value among the "
         "competitors; rows in *italics* are references and do not compete: *nearest demonstration* "
-        "is how far the recordings are from each other, *replay* plays the recording back.",
+        "is how far the recordings are from each other, *replay* plays the recording back. Rows "
+        "marked *uses time* follow a clock that was started with the motion: they are no field, so "
+        "that what is asked of a field is – there, and are no competitors either.",
         "",
         "Written by `python leaderboard/build.py` from the records in "
         "[`results/`](results); do not edit.",
@@ -292,7 +294,7 @@ CAPTIONS = {
     "point for each shape; the dashed line is the median distance between the demonstrations.",
     "accuracy-fit-time": "Accuracy against the time to fit, LASA-26, reproduction.",
     "methods": "One shape by every method: demonstrations in orange, reproductions in green, "
-    "streamlines of the learned field in blue.",
+    "streamlines of the learned field in blue; what uses time has none.",
     "fields": "Every shape, as learned by ImitationFlow: demonstrations in orange, rollouts from "
     "their starts in green.",
 }
@@ -439,10 +441,10 @@ def _times(results: Sequence[Result]) -> str:
 
 
 def _reasons(boards: Sequence[Board]) -> list[str]:
-    """Return each competitor's reason, from the first cell that states one."""
+    """Return each method's reason, from the first cell that states one."""
     reasons: dict[str, str] = {}
     for board in boards:
-        for row in board.competitors:
+        for row in board.methods:
             for cell in row.cells.values():
                 if cell.guarantee is not None:
                     text = escaped(cell.guarantee.reason).rstrip(".")

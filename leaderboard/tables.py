@@ -158,7 +158,7 @@ def aggregate_table(
         emphasised(
             row,
             [
-                escaped(row.title),
+                named(row),
                 *(function(row) for function in before.values()),
                 *(column[row.method] for column in columns),
             ],
@@ -167,6 +167,12 @@ def aggregate_table(
         if references or not row.reference
     ]
     return table(header, lines)
+
+
+def named(row: Row) -> str:
+    """Return a row's name as tables show it, with the mark of what follows a clock."""
+    mark = "<br><sub>uses time</sub>" if row.uses_time and not row.reference else ""
+    return escaped(row.title) + mark
 
 
 def eligible_methods(board: Board) -> set[str]:
@@ -195,8 +201,8 @@ def _italic(cell: str) -> str:
 
 
 def rank_of(board: Board, row: Row) -> str:
-    """Return a row's mean rank, bold if it is the best; nothing for a reference."""
-    if row.reference:
+    """Return a row's mean rank, bold if it is the best; nothing for what does not compete."""
+    if not row.competes:
         return ""
     text = f"{board.mean_rank[row.method]:.2f}"
     return f"**{text}**" if row.method in board.best(board.mean_rank, "mean_rank") else text
@@ -218,7 +224,7 @@ def shape_table(board: Board, metric: str) -> list[str]:
     values = {row.method: row.by_environment(metric) for row in rows}
     lines = []
     for i, environment in enumerate(board.environments):
-        here = {row.method: float(values[row.method][i]) for row in rows if not row.reference}
+        here = {row.method: float(values[row.method][i]) for row in rows if row.competes}
         finite = [value for value in here.values() if not math.isnan(value)]
         better = get_metric(metric).better
         best = (min if better == "lower" else max)(finite) if finite else math.nan
@@ -232,11 +238,11 @@ def shape_table(board: Board, metric: str) -> list[str]:
                 text = "failed" if not all(cell.ok for cell in ran) else "–"
             if row.reference:
                 text = _italic(text)
-            elif text not in ("–", "failed") and text == shown(metric, best):
+            elif row.competes and text not in ("–", "failed") and text == shown(metric, best):
                 text = f"**{text}**"
             cells.append(text)
         lines.append([shape_name(environment), *cells])
-    titles = [f"*{escaped(row.title)}*" if row.reference else escaped(row.title) for row in rows]
+    titles = [f"*{escaped(row.title)}*" if row.reference else named(row) for row in rows]
     return table(["Shape", *titles], lines)
 
 

@@ -306,7 +306,7 @@ def test_force_control_is_scored_through_the_mass():
 
 
 def test_what_is_no_policy_or_no_environment_is_refused(env):
-    with pytest.raises(TypeError, match=r"Expected a fitted DynamicalSystem or a policy"):
+    with pytest.raises(TypeError, match=r"Expected a fitted method or a policy"):
         score(object(), env, 0)
     with pytest.raises(TypeError, match=r"Expected an environment of iflow_gym"):
         score(fitted(env), gymnasium.make("CartPole-v1"), 0)

@@ -23,6 +23,7 @@ CORE = (
     "iflow_gym.demonstrations",
     "iflow_gym.evaluate",
     "iflow_gym.policy",
+    "iflow_gym.primitive",
     "iflow_gym.system",
 )
 """Modules that every score depends on, beside the packages in `CORE_PACKAGES`."""

@@ -37,7 +37,7 @@ from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.metrics import metrics_hash
 from iflow_gym.registration import POINT_MASS_ID
 from iflow_gym.results import ResultFileError, read_result, result_path, short_name
-from iflow_gym.system import DynamicalSystem
+from iflow_gym.system import Method
 
 BATCH_SIZE = 15
 """Cells that are fitted together at most, for methods that can. Half of LASA's shapes: two workers
@@ -63,6 +63,8 @@ class Entry:
     config: dict[str, Any]
     """All settings, defaults included, as JSON holds them."""
     integrator: str | None
+    uses_time: bool
+    """Whether it follows a clock and has no field."""
     code: str
     """Hash of the code."""
     libraries: tuple[str, ...]
@@ -152,6 +154,7 @@ def _reference(name: str) -> Entry:
         settings={},
         config={},
         integrator=None,
+        uses_time=reference.uses_time,
         code=code.sha256,
         libraries=code.libraries,
         versions=versions(code.libraries),
@@ -178,10 +181,11 @@ def _method(name: str, preset: str) -> Entry:
         target=METHODS.get(name, name),
         reference=False,
         stochastic=method.stochastic_fit,
-        batched=method._fit_many is not DynamicalSystem._fit_many,
+        batched=method._fit_many is not Method._fit_many,
         settings=settings,
         config=json.loads(json.dumps(dataclasses.asdict(config), default=str)),
         integrator=method.integrator,
+        uses_time=method.uses_time,
         code=code.sha256,
         libraries=code.libraries,
         versions=versions(code.libraries),

@@ -22,7 +22,7 @@ from iflow_gym.baselines.runner.plan import Cell, demonstrations_of, family
 from iflow_gym.evaluate import Evaluation, evaluate
 from iflow_gym.metrics import METRICS, FitCost, measure_cost
 from iflow_gym.results import Result, check_metrics
-from iflow_gym.system import DynamicalSystem
+from iflow_gym.system import Method
 
 THREADS = 1
 """Threads of a worker."""
@@ -33,7 +33,7 @@ BYTES_PER_MB = 1_000_000
 class Fit(NamedTuple):
     """A fitted system and what fitting its batch took."""
 
-    system: DynamicalSystem
+    system: Method
     cost: FitCost
     """Its memory is the rise above what the worker held before, and the whole batch's."""
     batch_size: int
@@ -146,6 +146,7 @@ def _common(cell: Cell) -> dict[str, Any]:
         "target": entry.target,
         "config": entry.config,
         "integrator": entry.integrator,
+        "uses_time": entry.uses_time,
         "hashes": cell.hashes,
         "versions": entry.versions,
         "hardware": hardware(THREADS),
