@@ -21,6 +21,9 @@ METHODS = {
     "imitation-flow": "iflow_gym.baselines.imitation_flow:ImitationFlow",
     "linear": "iflow_gym.baselines.linear:StableLinear",
     "gmr": "iflow_gym.baselines.gmr:GMR",
+    "gpr": "iflow_gym.baselines.gpr:GPR",
+    "lwr": "iflow_gym.baselines.lwr:LWR",
+    "bc": "iflow_gym.baselines.behavioural_cloning:BehaviouralCloning",
 }
 """Name to ``module:Class`` of every method, a `Method` whose `name` is the key."""
 

@@ -211,7 +211,7 @@ class Method(ABC):
         arrays = {k: np.ascontiguousarray(a) for k, a in self._arrays().items()}
         arrays["goal"] = np.array(self.goal_)
         if self.period_ is not None:
-            arrays["period"] = np.array(self.period_)
+            arrays["period"] = np.array([self.period_])
         for key, array in arrays.items():
             _check_numbers(key, array)
         target = Path(path)
@@ -410,9 +410,9 @@ def _period(array: np.ndarray[Any, Any] | None, learns_cycles: bool) -> float | 
         return None
     if not learns_cycles:
         raise ValueError(f"expected a motion that ends, got a period of {array}")
-    if array.shape != () or not array > 0:
+    if array.shape != (1,) or not array[0] > 0:
         raise ValueError(f"expected one period > 0, got {array}")
-    return float(array)
+    return float(array[0])
 
 
 def _check_numbers(key: str, array: np.ndarray[Any, Any]) -> None:
