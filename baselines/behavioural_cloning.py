@@ -169,6 +169,8 @@ class BehaviouralCloning(DynamicalSystem):
             )
         if not (scales > 0).all():
             raise ValueError(f"expected scales > 0, got {scales}")
+        if not all(np.isfinite(a.astype(np.float32)).all() for a in layers):
+            raise ValueError("expected weights that single precision holds, got larger ones")
         self._adopt(layers, centre, *scales)
 
 

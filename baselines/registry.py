@@ -24,6 +24,9 @@ METHODS = {
     "gpr": "iflow_gym.baselines.gpr:GPR",
     "lwr": "iflow_gym.baselines.lwr:LWR",
     "bc": "iflow_gym.baselines.behavioural_cloning:BehaviouralCloning",
+    "dmp": "iflow_gym.baselines.dmp:DMP",
+    "promp": "iflow_gym.baselines.promp:ProMP",
+    "kmp": "iflow_gym.baselines.kmp:KMP",
 }
 """Name to ``module:Class`` of every method, a `Method` whose `name` is the key."""
 

@@ -21,17 +21,16 @@ from iflow_gym.system import Method, seconds, step_times, whole_number
 PhaseState = dict[str, FloatArray]
 """What a primitive remembers between two steps: arrays by name, a row for each of n states."""
 
-SAME_START = 1e-9
-"""Recordings whose starts are nearest within this fraction of the distance are equally near."""
-
 
 class MovementPrimitive(Method):
     """A motion that is driven by a phase, learned from demonstrations.
 
     The phase s runs from 0 to 1 in the motion's duration and on beyond it, where a motion that ends
-    holds its goal; of a motion that repeats, one round is one unit of phase. How long a motion
-    takes is not to be seen in a start, so it is taken from the recording that began nearest to it
-    (the mean of those that began equally near); a round takes the demonstrations' period.
+    holds its goal; of a motion that repeats, one round is one unit of phase and takes the
+    demonstrations' period. How long a motion from x0 takes is the mean of what the demonstrations
+    took, weighted by 1 / ‖x0 - start‖² (Shepard, "A two-dimensional interpolation function for
+    irregularly-spaced data", Proc. 23rd ACM National Conference, 1968): from a demonstrated start
+    it is that demonstration's time, from far away the mean.
 
     Attributes
     ----------
@@ -72,10 +71,11 @@ class MovementPrimitive(Method):
     def duration(self, x: ArrayLike) -> FloatArray:
         """Return the seconds, shape (...), that the motion from x, shape (..., d), takes."""
         states, shape = self._states(x)
-        distances = np.linalg.norm(states[:, None] - self.starts_, axis=-1)
-        least = distances.min(axis=1, keepdims=True)
-        nearest = distances <= least * (1 + SAME_START) + np.finfo(np.float64).tiny
-        durations: FloatArray = (nearest @ self.durations_) / nearest.sum(axis=1)
+        squares = ((states[:, None] - self.starts_) ** 2).sum(axis=-1)
+        least = squares.min(axis=1, keepdims=True)
+        # Relative to the nearest: from a demonstrated start, that one has all the weight.
+        weights = np.where(squares > 0, least / np.where(squares > 0, squares, 1.0), 1.0)
+        durations: FloatArray = weights @ self.durations_ / weights.sum(axis=1)
         return durations.reshape(shape[:-1])
 
     def advance(
