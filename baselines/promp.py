@@ -248,7 +248,8 @@ def _rounds(demonstrations: Demonstrations, n_basis: int) -> list[tuple[FloatArr
     """Return phases and positions of each whole round, and of recordings shorter than one."""
     found = []
     for s, p in zip(phases(demonstrations, n_basis), demonstrations.positions, strict=True):
-        n_rounds = max(1, int(np.floor(s[-1] - s[0] + 0.01)))
-        number = np.minimum(np.floor(s - s[0]), n_rounds - 1)
+        done = s - s[0] + 1e-9  # so that rounding does not put a round's first sample before it
+        n_rounds = max(1, int(done[-1] + done[1]))  # n samples show n sample times
+        number = np.minimum(np.floor(done), n_rounds - 1)
         found += [(s[number == k], p[number == k]) for k in range(n_rounds)]
     return found
