@@ -86,6 +86,10 @@ box enlarged by half of each side at every end, over five times the longest reco
 recordings' starts with a push of 25 % of the box's diagonal at 40 % of the way. Converged means
 within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
 
+**Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,
+direction, velocity, likelihood, Lyapunov function) is null for them, not zero. They converge because
+their clock runs out, and are marked and not ranked.
+
 **Guarantees.** `proved`: by construction, for every state. `verified`: checked on a bounded region
 with an error bound. `sampled`: seen to hold where it was tried. `none`. Each method states its own,
 with the reason.

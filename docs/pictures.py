@@ -1,9 +1,12 @@
-"""Makes the pictures of the documentation: `python docs/pictures.py`, a minute and a half.
+"""Makes the pictures of the documentation: `python docs/pictures.py`, two minutes.
 
 docs/images/bend.png         the README's: one latent system, bent into three motions
 docs/images/environment.png  a frame of an environment, with a policy's stream lines
+docs/images/<method>.png     what a method does, for every page of docs/methods that shows it;
+                             `python docs/pictures.py <method> ...` draws these alone
 """
 
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,8 +16,13 @@ from matplotlib.figure import Figure
 
 import iflow_gym  # registers the environments
 from iflow_gym.baselines.imitation_flow import ImitationFlow
+from iflow_gym.baselines.registry import METHODS, load_method
 from iflow_gym.datasets.lasa import load_lasa
-from iflow_gym.plotting import plot_field, plot_streamlines
+from iflow_gym.envs.task import Push
+from iflow_gym.figures import reproductions, save_figure
+from iflow_gym.plotting import plot_field, plot_rollouts, plot_streamlines
+from iflow_gym.policy import policy_of
+from iflow_gym.registration import lasa_id
 
 IMAGES = Path(__file__).parent / "images"
 SHAPES = ("Sshape", "GShape", "Sharpc")
@@ -59,7 +67,59 @@ def environment() -> None:
     figure.savefig(IMAGES / "environment.png")
 
 
+def pushed(method, shape: str, index: int, push: Push | None) -> np.ndarray:
+    """Return a path of two durations through the environment, shape (T, 2)."""
+    n = 2 * len(load_lasa(shape).positions[index])
+    env = gym.make(lasa_id(shape), perturbation=push, horizon=n)
+    policy, state = policy_of(method, env), None
+    observation, _ = env.reset(seed=0, options={"demonstration": index})
+    path = [observation]
+    for _ in range(n):
+        action, state = policy.predict(observation, state)
+        observation, *_ = env.step(action)
+        path.append(observation)
+    return np.stack(path)
+
+
+def method_sheet(name: str) -> Figure:
+    """Draw a method from the recordings' starts, from elsewhere, and pushed on its way."""
+    figure = Figure(figsize=(10, 3.5), layout="constrained", facecolor="white")
+    axes = figure.subplots(1, 3)
+    titles = ("from the recordings' starts", "from elsewhere", "pushed, and not (pale)")
+    for ax, shape, title in zip(axes, ("Sshape", "Sharpc", "Angle"), titles, strict=True):
+        motion = load_lasa(shape)
+        method = load_method(name)().fit(motion, seed=0)
+        plot_field(ax, method, motion, density=1.0)
+        ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        ax.set_title(title, fontsize=10, pad=4)
+        if ax is axes[0]:
+            plot_rollouts(ax, reproductions(method, motion))
+        elif ax is axes[1]:
+            low, high = motion.bounding_box
+            sides = np.linspace(low - 0.2 * (high - low), high + 0.2 * (high - low), 4)
+            starts = np.stack(np.meshgrid(*sides.T), axis=-1).reshape(-1, 2)
+            n = 2 * len(motion.positions[0])
+            plot_rollouts(ax, method.rollout(starts, n, motion.mean_dt), linewidth=0.9)
+        else:
+            for k, direction in enumerate(((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))):
+                path = pushed(method, shape, k, None)
+                plot_rollouts(ax, [path], color="#a9c9bc")
+                path = pushed(method, shape, k, Push(direction=direction))
+                plot_rollouts(ax, [path], linewidth=1.2)
+    return figure
+
+
+def method_sheets(names: list[str]) -> None:
+    """Draw the methods whose page shows their picture, or the named ones."""
+    for name in names or METHODS:
+        page = IMAGES.parent / "methods" / f"{name}.md"
+        if names or (page.is_file() and f"images/{name}.png" in page.read_text()):
+            save_figure(method_sheet(name), IMAGES / f"{name}.png", dpi=100)
+
+
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
-    environment()
-    bend()
+    if len(sys.argv) == 1:
+        environment()
+        bend()
+    method_sheets(sys.argv[1:])
