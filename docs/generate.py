@@ -87,8 +87,8 @@ recordings' starts with a push of 25 % of the box's diagonal at 40 % of the way.
 within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
 
 **Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,
-direction, velocity, likelihood, Lyapunov function) is null for them, not zero. They converge because
-their clock runs out, and are marked and not ranked.
+direction, velocity, likelihood, Lyapunov function) is null for them, not zero. They converge
+because their clock runs out, and are marked and not ranked.
 
 **Guarantees.** `proved`: by construction, for every state. `verified`: checked on a bounded region
 with an error bound. `sampled`: seen to hold where it was tried. `none`. Each method states its own,

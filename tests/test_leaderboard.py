@@ -148,6 +148,31 @@ def test_a_metric_that_no_field_means_no_last_rank(builder):
     assert board.rows[0].aggregate("seds_error") is None
 
 
+def test_what_uses_time_is_shown_and_marked_and_does_not_compete(builder):
+    """However good it is: the clock's rows are neither ranked nor bold, and lose nobody a rank."""
+    none = dict.fromkeys(("seds_error", "direction_error", "velocity_rmse"))
+    clock = [
+        record("clock", s, 0.1, uses_time=True, guarantee=Guarantee("none", "a clock drives it"),
+               metrics=record("x", s, 0.1).metrics | none)
+        for s in SINGLE_MOTIONS
+    ]  # fmt: skip
+    results = clock + sweep("good", 1.0) + sweep("bad", 2.0)
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"good": 1.0, "bad": 2.0}
+    assert [row.method for row in board.rows] == ["good", "bad", "clock"]
+    assert [row.method for row in board.methods] == ["good", "bad", "clock"]
+    page = render(builder, results)
+    header, rows = rows_of(section(page, "Accuracy"))
+    clock_row = rows["Clock<br><sub>uses time</sub>"]
+    assert clock_row[header.index("Mean rank")] == ""
+    assert not any("**" in cell for cell in clock_row)
+    assert clock_row[header.index("SEDS error")] == "–"
+    assert any("**" in cell for cell in rows["Good"])
+    assert "Clock, *none*: a clock drives it." in page
+    stability = rows_of(section(page, "Stability"))[1]
+    assert "none" in stability["Clock<br><sub>uses time</sub>"]
+
+
 def test_references_are_below_and_have_no_rank(builder):
     results = sweep("replay", 0.01, reference=True, guarantee=None) + sweep("slow", 3.0)
     (board,) = boards_of(builder, results)
