@@ -218,6 +218,7 @@ def boxes(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
         heading(metric, unit): {
             row.method: np.array([v for v, ran in _tried(row, metric) if ran])
             for row in _drawn(board, styles)
+            if row.applies(metric)  # what has no field has no box for it, and has not failed
         }
         for metric in BOXES
     }

@@ -171,6 +171,10 @@ def test_what_uses_time_is_shown_and_marked_and_does_not_compete(builder):
     assert "Clock, *none*: a clock drives it." in page
     stability = rows_of(section(page, "Stability"))[1]
     assert "none" in stability["Clock<br><sub>uses time</sub>"]
+    styles = builder.styles_of(board)
+    assert styles["clock"].guarantee == "none, uses time"
+    figure = builder.boxes(board, styles, "mm")
+    assert not [t for t in figure.findobj(Text) if "not finite or failed" in t.get_text()]
 
 
 def test_references_are_below_and_have_no_rank(builder):

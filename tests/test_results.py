@@ -101,6 +101,14 @@ def test_what_cannot_be_written_leaves_the_old_record(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
+def test_a_record_from_before_methods_used_time_is_read(tmp_path):
+    path = write_result(tmp_path, record())
+    values = json.loads(path.read_text())
+    del values["uses_time"]
+    path.write_text(json.dumps(values))
+    assert read_result(path) == record(uses_time=False)
+
+
 def broken_files(path):
     """What is wrong, the file's text, and what the error says."""
     values = json.loads(path.read_text())
