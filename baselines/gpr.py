@@ -28,11 +28,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
 
@@ -156,19 +158,23 @@ class GPR(DynamicalSystem):
     def _velocity(self, x: FloatArray) -> FloatArray:
         return self._kernel(x - self._goal) @ self.alpha_
 
-    def variance(self, x: FloatArray) -> FloatArray:
-        """Return the predictive variance of each component, shape (n,), noise included.
+    def variance(self, x: ArrayLike) -> FloatArray:
+        """Return the predictive variance of each component, shape (...), noise included.
 
-        For positions x, shape (n, d), in (length/s)^2; see the module's deviation.
+        For positions x, shape (..., d), in (length/s)^2; see the module's deviation.
         """
-        k = self._kernel(np.asarray(x, dtype=np.float64) - self._goal)
+        states, shape = self._states(x)
+        return self._variance(states).reshape(shape[:-1])
+
+    def _variance(self, x: FloatArray) -> FloatArray:
+        k = self._kernel(x - self._goal)
         explained = (k * cho_solve((self._root, True), k.T).T).sum(axis=1)
         return np.asarray(
             self.noise_variance_ + np.clip(self.signal_variance_ - explained, 0.0, None)
         )
 
     def _log_prob(self, x: FloatArray, x_next: FloatArray, dt: float) -> FloatArray:
-        residual, variance = (x_next - x) / dt - self._velocity(x), self.variance(x)
+        residual, variance = (x_next - x) / dt - self._velocity(x), self._variance(x)
         d = x.shape[1]
         squares = (residual**2).sum(axis=1) / variance
         return np.asarray(-0.5 * (squares + d * np.log(2 * np.pi * variance)) - d * np.log(dt))
@@ -236,9 +242,3 @@ def maximise_likelihood(x: FloatArray, v: FloatArray) -> tuple[float, FloatArray
         np.atleast_1d(found.k1.k2.length_scale),
         float(found.k2.noise_level),
     )
-
-
-def evenly(samples: FloatArray, n: int) -> FloatArray:
-    """Return n samples, evenly taken from the first to the last; all where there are fewer."""
-    chosen = np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int)
-    return np.asarray(samples[chosen])

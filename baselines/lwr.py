@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
 
@@ -210,9 +211,3 @@ def choose_bandwidth(
         for j, h in enumerate(BANDWIDTHS):
             errors[j] += np.sum((LocalFits(kept_x / h, kept_v, ridge)(x[out] / h) - v[out]) ** 2)
     return float(BANDWIDTHS[int(errors.argmin())])
-
-
-def evenly(samples: FloatArray, n: int) -> FloatArray:
-    """Return n samples, evenly taken from the first to the last; all where there are fewer."""
-    chosen = np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int)
-    return np.asarray(samples[chosen])

@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iflow_gym.baselines.cycles import circular_bases, nearest_phase, phases, ridge_regression
 from iflow_gym.baselines.starts import EXACTNESS, GivenStart, minimum_jerk
@@ -141,7 +142,7 @@ class ProMP(MovementPrimitive):
         return np.asarray(flat.T @ flat / len(flat))
 
     def condition(
-        self, phase: float, position: FloatArray, variance: float | None = None
+        self, phase: float, position: ArrayLike, variance: float | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Return the Gaussian over w given that the motion passes a position at a phase.
 
@@ -158,6 +159,11 @@ class ProMP(MovementPrimitive):
         -------
         mean : array, shape (d, n_basis)
         covariance : array, shape (d n_basis, d n_basis)
+
+        Raises
+        ------
+        ValueError
+            If the position has another shape.
         """
         self._require_fit()
         d = self.n_dims_
@@ -167,6 +173,8 @@ class ProMP(MovementPrimitive):
         noise = EXACTNESS * np.trace(there) / d if variance is None else variance
         gain = np.linalg.solve(there + noise * np.eye(d), psi.T @ sigma).T
         mean = self.mean_.ravel()
+        if np.shape(position) != (d,):
+            raise ValueError(f"Expected a position of shape {(d,)}, got {np.shape(position)}.")
         offset = np.asarray(position, dtype=np.float64) - self._centre
         conditional = mean + gain @ (offset - psi.T @ mean)
         return conditional.reshape(d, -1), np.asarray(sigma - gain @ psi.T @ sigma)

@@ -6,7 +6,8 @@ from scipy.stats import multivariate_normal
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from iflow_gym.baselines.gpr import GPR, evenly, maximise_likelihood
+from iflow_gym.baselines.gpr import GPR, maximise_likelihood
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
 
