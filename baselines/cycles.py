@@ -25,7 +25,7 @@ def circular_bases(phase: FloatArray, n_basis: int) -> FloatArray:
     """Return von Mises bases that sum to 1, shape (n, n_basis), of phases in rounds, shape (n,).
 
     Ijspeert, Nakanishi, Hoffmann, Pastor & Schaal, "Dynamical movement primitives", Neural
-    Computation 25(2), 2013, eq. (2.9): psi_i = exp(h (cos(2 pi s - c_i) - 1)).
+    Computation 25(2), 2013, table 1: psi_i = exp(h (cos(2 pi s - c_i) - 1)).
     """
     half = np.pi / n_basis
     h = np.log(OVERLAP) / (np.cos(half) - 1)

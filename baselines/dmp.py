@@ -2,9 +2,9 @@
 
 A critically damped spring pulls to the goal, and a forcing term that a phase drives makes the
 shape of the way (Ijspeert, Nakanishi, Hoffmann, Pastor & Schaal, "Dynamical movement primitives:
-learning attractor models for motor behaviors", Neural Computation 25(2), 2013, eq. (2.1)-(2.5); in
+learning attractor models for motor behaviors", Neural Computation 25(2), 2013, eq. (2.1)-(2.3); in
 the form of Pastor, Hoffmann, Asfour & Schaal, "Learning and generalization of motor skills by
-learning from demonstration", ICRA 2009, eq. (6)-(8), whose forces do not grow with g - y0 and whose
+learning from demonstration", ICRA 2009, whose forces do not grow with g - y0 and whose
 spring does not jump at the start). With ' = d/ds, s the time in durations, beta = alpha / 4 and
 z = exp(-alpha_z s):
 
@@ -16,7 +16,7 @@ regression. Here all demonstrations are used: the weights, and the first y', are
 mean given the start (`starts`).
 
 A motion that repeats has circular bases, no factor z, the mean of its samples for a goal, and is
-fitted to all recordings at once, their phases aligned (2013, eq. (2.9), (2.10)).
+fitted to all recordings at once, their phases aligned (2013, table 1, right column).
 
 The system goes on from where the mass is: y is observed at every step, y' is the primitive's own.
 A step is exact for the forces at its middle.

@@ -3,13 +3,13 @@
 Of the demonstrations a reference is taken: the mean mu_n and the covariance Sigma_n of the position
 at N phases s_n. The motion whose parameters have the least Kullback-Leibler divergence from it is,
 with a kernel in place of the bases (Huang, Rozo, Silverio & Caldwell, "Kernelized movement
-primitives", IJRR 38(7), 2019, eq. (21)),
+primitives", IJRR 38(7), 2019, the mean prediction),
 
     r(s) = k(s) (K + lambda Sigma)^-1 mu,   K_ij = k(s_i, s_j) I,   Sigma = blockdiag(Sigma_n),
 
 which is Gaussian process regression of the mean with the demonstrations' spread for noise. To pass
 through a point, the reference has that point, with a small covariance, in place of its own at the
-phase (ibid., section 4.1): here the start x0 at s = 0 and the goal at s = 1. The kernel is the
+phase (ibid., on via-points): here the start x0 at s = 0 and the goal at s = 1. The kernel is the
 squared exponential; its length and lambda are those of least error on demonstrations left out one
 at a time. What runs is r(s) with the tracking controller of `ProMP`.
 

@@ -2,7 +2,7 @@
 
 A motion is a weighted sum of bases of the phase, y(s) = w^T phi(s), and demonstrations are samples
 of a Gaussian over w (Paraschos, Daniel, Peters & Neumann, "Using probabilistic movement primitives
-in robotics", Autonomous Robots 42, 2018, eq. (1)-(3)). Each demonstration's weights are found by
+in robotics", Autonomous Robots 42, 2018). Each demonstration's weights are found by
 ridge regression, and the Gaussian is their mean and covariance. To begin at x0 it is conditioned,
 
     E[w | x0] = mu_w + Sigma_w Psi (Psi^T Sigma_w Psi + Sigma_y)^-1 (x0 - Psi^T mu_w),  Psi = Phi(0)
@@ -16,7 +16,7 @@ in closed form for any step. It is what a user runs on a robot that takes veloci
 controller of the papers has, for such a plant, the gain cov(y', y) cov(y)^-1: repelling where the
 demonstrations spread, undefined where they meet, and of no use after a push that none shows.
 
-A motion that repeats has circular bases (2018, section 2.1) and a round for a sample of w. Its mean
+A motion that repeats has circular bases (ibid.) and a round for a sample of w. Its mean
 orbit is tracked from the phase at which it is nearest to the start: conditioning would carry the
 offset of a start beside the orbit round with it for ever.
 
@@ -242,7 +242,7 @@ class ProMP(MovementPrimitive):
 def bases(phase: FloatArray, n_basis: int) -> FloatArray:
     """Return Gaussian bases that sum to 1, shape (n, n_basis), of phases, shape (n,).
 
-    2018, eq. (10), (11), with centres from 0 to 1.
+    Centres are spaced evenly from 0 to 1.
     """
     centres = np.linspace(0, 1, n_basis)
     width = -8 * n_basis**2 * np.log(OVERLAP)

@@ -90,7 +90,7 @@ class GivenStart(NamedTuple):
 def minimum_jerk(phase: FloatArray) -> FloatArray:
     """Return the share, shape (n,), of a way from rest to rest that is done at phases in [0, 1].
 
-    Flash & Hogan, "The coordination of arm movements", J. Neuroscience 5(7), 1985, eq. (3).
+    Flash & Hogan, "The coordination of arm movements", J. Neuroscience 5(7), 1985.
     """
     s = np.clip(phase, 0.0, 1.0)
     return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))

@@ -37,7 +37,7 @@ def test_with_isotropic_covariances_it_is_gaussian_process_regression():
 
 
 def test_it_is_the_formula_with_full_covariances():
-    """IJRR 2019, eq. (21), written out with block matrices."""
+    """The mean prediction of IJRR 2019, written out with block matrices."""
     rng = np.random.default_rng(0)
     means, roots = rng.normal(size=(6, 2)), rng.normal(size=(6, 2, 2))
     covariances = roots @ np.swapaxes(roots, 1, 2)
