@@ -6,9 +6,11 @@ from movement_primitives.promp import ProMP as Oracle
 
 from iflow_gym.baselines.cycles import circular_bases, phases
 from iflow_gym.baselines.promp import ProMP, bases
+from iflow_gym.baselines.registry import load_method
 from iflow_gym.baselines.starts import EXACTNESS, GivenStart, minimum_jerk
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.evaluate import evaluate
 
 
 def fitted(shape="Sshape", **settings):
@@ -151,3 +153,12 @@ def test_settings_that_make_no_sense_are_refused():
     for settings, said in (({"n_basis": 3}, "n_basis >= 4"), ({"feedback": 0.0}, "a finite feed")):
         with pytest.raises(ValueError, match=f"Expected {said}"):
             ProMP(**settings)
+
+
+@pytest.mark.parametrize("name", ["promp", "dmp"])
+@pytest.mark.parametrize(("shape", "anchor"), [("Angle", 1.8), ("Sshape", 1.8), ("Sharpc", 1.7)])
+def test_recordings_are_followed_as_closely_as_by_others(name, shape, anchor):
+    """As closely as another code's ProMP, conditioned on the start, to the decimal that is known."""
+    primitive = load_method(name)().fit(load_lasa(shape), seed=0)
+    found = evaluate(primitive, f"iflow/LASA-{shape}-v0", seed=0, stability=False)
+    assert round(found.metrics["frechet"], 1) <= anchor
