@@ -318,5 +318,5 @@ def test_the_command_line_explains_itself_and_refuses_in_a_line(tmp_path):
     assert "--preset" in shown.stdout
     refused = run("--methods", "liner", "--output", "results")
     assert refused.returncode == 2
-    assert refused.stderr.startswith("run_all.py: Unknown method 'liner'. Did you mean linear?")
+    assert refused.stderr.startswith("run_all.py: Unknown method 'liner'. Did you mean linear")
     assert not (tmp_path / "results").exists()

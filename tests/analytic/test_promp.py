@@ -158,7 +158,7 @@ def test_settings_that_make_no_sense_are_refused():
 @pytest.mark.parametrize("name", ["promp", "dmp"])
 @pytest.mark.parametrize(("shape", "anchor"), [("Angle", 1.8), ("Sshape", 1.8), ("Sharpc", 1.7)])
 def test_recordings_are_followed_as_closely_as_by_others(name, shape, anchor):
-    """As closely as another code's ProMP, conditioned on the start, to the decimal that is known."""
+    """As another code's ProMP, conditioned on the start, to the decimal that is known of it."""
     primitive = load_method(name)().fit(load_lasa(shape), seed=0)
     found = evaluate(primitive, f"iflow/LASA-{shape}-v0", seed=0, stability=False)
     assert round(found.metrics["frechet"], 1) <= anchor
