@@ -10,7 +10,6 @@ methods need not.
 from __future__ import annotations
 
 import dataclasses
-import json
 import operator
 import os
 from abc import ABC, abstractmethod
@@ -20,14 +19,15 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, SupportsIndex, get_args
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 from numpy.typing import ArrayLike
 
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-
-SCHEMA_VERSION = 1
-"""Version of the model files that `DynamicalSystem.save` writes."""
+from iflow_gym.model_files import (
+    ModelFileError,
+    model_file_errors,
+    read_model_file,
+    write_model_file,
+)
 
 SYMMETRIC = 1e-9
 """How far a covariance may be from symmetric, with variances scaled to 1: rounding."""
@@ -203,24 +203,14 @@ class Method(ABC):
         """Write a safetensors file whose header holds the settings as JSON; replace atomically."""
         self._require_fit()
         header = {
-            "schema_version": SCHEMA_VERSION,
             "method": self.name,
             "config": dataclasses.asdict(self.config),
             "n_dims": self.n_dims_,
         }
-        arrays = {k: np.ascontiguousarray(a) for k, a in self._arrays().items()}
-        arrays["goal"] = np.array(self.goal_)
+        arrays = self._arrays() | {"goal": np.array(self.goal_)}
         if self.period_ is not None:
             arrays["period"] = np.array([self.period_])
-        for key, array in arrays.items():
-            _check_numbers(key, array)
-        target = Path(path)
-        partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
-        partial.write_bytes(
-            safetensors.numpy.save(arrays, metadata={"iflow_gym": json.dumps(header)})
-        )
-        partial.replace(target)
-        return target
+        return write_model_file(path, header, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -230,7 +220,7 @@ class Method(ABC):
             raise ModelFileError(
                 f"Expected {path} to hold a {cls.name!r} model, got {header['method']!r}."
             )
-        try:
+        with model_file_errors(path, cls.name):
             config, n_dims = header["config"], header["n_dims"]
             if not isinstance(config, dict):
                 raise ValueError(f"expected a config of settings by name, got {config!r}")
@@ -246,12 +236,6 @@ class Method(ABC):
                 system._restore(arrays)
             if (names := sorted(system._arrays())) != sorted(arrays):
                 raise ValueError(f"expected the arrays {names}, got {sorted(arrays)}")
-        except KeyError as error:
-            raise ModelFileError(
-                f"{path} is no whole {cls.name!r} model: expected {error} in it, got none."
-            ) from error
-        except _BAD_FILE as error:
-            raise ModelFileError(f"{path} is no whole {cls.name!r} model: {error}.") from error
         return system
 
 
@@ -329,56 +313,6 @@ class DynamicalSystem(Method):
         return None
 
 
-class ModelFileError(ValueError):
-    """A model file is not what it should be."""
-
-
-_BAD_FILE = (
-    safetensors.SafetensorError,
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    RuntimeError,
-    TypeError,
-    ValueError,  # np.linalg.LinAlgError too
-)
-"""What reading a file that `save` did not write may raise: its contents are anyone's."""
-
-
-def read_model_file(
-    path: str | os.PathLike[str],
-) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
-    """Return the header and the arrays of a model file; nothing in it is executed."""
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {})["iflow_gym"])
-            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no dict)
-        if not isinstance(header, dict):
-            raise ValueError(f"its header is {header!r}")
-        if missing := {"schema_version", "method", "config", "n_dims"} - set(header):
-            raise ValueError(f"its header is without {sorted(missing)}")
-        version = header["schema_version"]
-        if type(version) is not int or version < 1:
-            raise ValueError(f"its schema version is {version!r}")
-    except FileNotFoundError:
-        raise
-    except _BAD_FILE as error:
-        raise ModelFileError(
-            f"Expected {path} to be a model file of iflow-gym, got something else: {error}."
-        ) from error
-    if version > SCHEMA_VERSION:
-        raise ModelFileError(
-            f"{path} has schema version {version}, this package reads up to {SCHEMA_VERSION}: "
-            "upgrade iflow-gym."
-        )
-    for key, array in arrays.items():
-        try:
-            _check_numbers(key, array)
-        except ValueError as error:
-            raise ModelFileError(f"{path} is no model of iflow-gym: {error}") from error
-    return header, arrays
-
-
 def _as_tuples(config: Mapping[str, Any]) -> dict[str, Any]:
     """JSON has lists where settings have tuples."""
     return {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}
@@ -413,13 +347,6 @@ def _period(array: np.ndarray[Any, Any] | None, learns_cycles: bool) -> float | 
     if array.shape != (1,) or not array[0] > 0:
         raise ValueError(f"expected one period > 0, got {array}")
     return float(array[0])
-
-
-def _check_numbers(key: str, array: np.ndarray[Any, Any]) -> None:
-    if array.dtype.kind != "f":
-        raise ValueError(f"Expected real floating numbers in {key!r}, got {array.dtype}.")
-    if not np.isfinite(array).all():
-        raise ValueError(f"Expected finite numbers in {key!r}, got NaN or infinity.")
 
 
 def step_times(dt: float | FloatArray, shape: tuple[int, ...]) -> FloatArray:

@@ -15,7 +15,7 @@ from iflow_gym.baselines.linear import (
 from iflow_gym.baselines.ornstein_uhlenbeck import transition
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
-from iflow_gym.system import ModelFileError
+from iflow_gym.model_files import ModelFileError
 
 SPIRAL = np.array([[-1.5, 4.0], [-3.0, -2.0]])
 GOAL = np.array([30.0, -7.0])

@@ -18,15 +18,9 @@ from iflow_gym.baselines.registry import KINDS, METHODS, load_method
 from iflow_gym.baselines.runner.presets import load_settings
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.model_files import SCHEMA_VERSION, ModelFileError, read_model_file
 from iflow_gym.primitive import MovementPrimitive
-from iflow_gym.system import (
-    SCHEMA_VERSION,
-    DynamicalSystem,
-    Guarantee,
-    ModelFileError,
-    NotFittedError,
-    read_model_file,
-)
+from iflow_gym.system import DynamicalSystem, Guarantee, NotFittedError
 
 QUICK = {"imitation-flow": {"n_steps": 60}}
 """Settings of methods that would take long by their smoke preset, too; an accurate fit is not what
