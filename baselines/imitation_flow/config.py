@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 Objective = Literal["reproduction", "paper"]
+Emission = Literal["coupling", "autoregressive", "spline"]
+MOST_LOG_SCALE = 2.0
+"""With 2 the inverse has been seen to be off by more than the motion's size in single precision."""
+
+Noise = Literal["additive", "vanishing"]
 
 
 @dataclass(frozen=True)
@@ -16,17 +21,24 @@ class ImitationFlowConfig:
     objective: Objective = "reproduction"
     """"reproduction": forward likelihood, then the squared error of whole reproductions.
     "paper": the backward likelihood of Algorithm 1 and nothing else."""
-    n_layers: int = 24
-    """Coupling layers, each behind an orthogonal transform."""
+    emission: Emission = "coupling"
+    """Layers of the flow: "coupling" (affine), "autoregressive" (masked, for three dimensions and
+    more: the paper's for the robot), or "spline" (rational-quadratic couplings)."""
+    n_layers: int = 16
+    """Layers of the flow, each behind an orthogonal transform."""
     n_hidden: int = 16
     """tanh units in each layer's conditioner, which has one hidden layer."""
-    log_scale_bound: float = 0.3
+    n_bins: int = 8
+    """Pieces of a spline ("spline" only)."""
+    spline_bound: float = 2.0
+    """A spline is the identity outside [-bound, bound], in units of the motion ("spline" only)."""
+    log_scale_bound: float = 0.35
     """Bound c of a layer's log-scale, c tanh(s / c): small enough that the inverse is exact in
     floating point, see the method's page."""
-    sharpness: float = 2.0
+    sharpness: float = 3.0
     """Slope of the conditioners' units at the start, in the inverse of half the motion's size:
     larger bends sharper corners and generalises less."""
-    n_steps: int = 2400
+    n_steps: int = 5000
     """Steps of Adam."""
     likelihood_fraction: float = 0.2
     """Share of the steps that maximise the likelihood before the reproduction error is minimised
@@ -41,38 +53,61 @@ class ImitationFlowConfig:
     """Transitions in a step's likelihood."""
     n_times: int = 40
     """Times of each demonstration in a step's reproduction error."""
+    end_weight: float = 0.7
+    """Weight of the squared error at the last sample, beside the mean over times."""
     tube_weight: float = 0.05
     """Weight of the tube: a reproduction from beside a demonstration's start should run beside it
     and close in at constant speed. 0 leaves it out."""
     tube_width: float = 0.05
     """Standard deviation of the distance to the start, in half the motion's size."""
-    calm_weight: float = 0.05
+    calm_weight: float = 0.3
     """Weight of the penalty on speed away from the demonstrations. 0 leaves it out."""
     calm_speed: float = 1.5
     """Speeds up to this multiple of the demonstrations' peak cost nothing."""
     min_decay: float = 0.05
     """Slowest decay of the latent system, per duration: eps in A = -(L L^T + eps I) + S - S^T."""
+    noise: Noise = "additive"
+    """"additive": K dB, the state is bounded around the attractor in distribution. "vanishing":
+    noise in proportion to the distance from the attractor, the state comes to rest there."""
+    n_threads: int = 1
+    """Threads that models trained together are dealt out to, on a CPU."""
     device: str = "auto"
     """Where training runs: "auto" takes a GPU where torch has one; or a torch device."""
 
     def __post_init__(self) -> None:
-        if self.objective not in ("reproduction", "paper"):
-            raise ValueError(
-                f"Expected objective 'reproduction' or 'paper', got {self.objective!r}."
-            )
-        for name in ("n_layers", "n_hidden", "n_steps", "n_pairs", "n_times"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"Expected {name} >= 1, got {getattr(self, name)}.")
+        for name, known in (("objective", Objective), ("emission", Emission), ("noise", Noise)):
+            if getattr(self, name) not in get_args(known):
+                choices = ", ".join(map(repr, get_args(known)))
+                raise ValueError(f"Expected {name} among {choices}, got {getattr(self, name)!r}.")
+        for name in (
+            "n_layers",
+            "n_hidden",
+            "n_steps",
+            "n_pairs",
+            "n_times",
+            "n_threads",
+            "n_bins",
+        ):
+            value, least = getattr(self, name), 2 if name == "n_bins" else 1
+            if type(value) is not int or value < least:
+                raise ValueError(f"Expected a whole number {name} >= {least}, got {value!r}.")
+        if not isinstance(self.device, str):
+            raise ValueError(f"Expected the name of a device, got {self.device!r}.")
         for name in (
             "log_scale_bound", "sharpness", "learning_rate", "max_gradient_norm", "min_decay",
-            "calm_speed", "tube_width",
+            "calm_speed", "tube_width", "spline_bound",
         ):  # fmt: skip
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"Expected a finite {name} > 0, got {getattr(self, name)}.")
+        if self.log_scale_bound > MOST_LOG_SCALE:
+            raise ValueError(
+                f"Expected log_scale_bound <= {MOST_LOG_SCALE}, got {self.log_scale_bound}: the "
+                "inverse would not be exact in floating point."
+            )
         if not 0 <= self.likelihood_fraction <= 1:
             raise ValueError(
                 f"Expected likelihood_fraction in [0, 1], got {self.likelihood_fraction}."
             )
-        for name in ("likelihood_weight", "tube_weight", "calm_weight"):
+        for name in ("likelihood_weight", "tube_weight", "calm_weight", "end_weight"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"Expected a finite {name} >= 0, got {getattr(self, name)}.")

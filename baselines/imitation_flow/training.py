@@ -1,11 +1,11 @@
 """Training many ImitationFlows as one batched model.
 
-Positions are divided by one scale per motion and centred nowhere (the goal is mapped to the latent
-origin by subtraction); times are divided by the mean duration of the motion's recordings. The
-objectives are those of `ImitationFlowConfig.objective`:
+Positions are relative to the goal, in one unit of length a motion (`data.Frame`); times are divided
+by the mean duration of the motion's recordings. The objectives are those of
+`ImitationFlowConfig.objective`:
 
 "paper"
-    Algorithm 1: backward conditionals p(y_i | y_{i+dT}) for a random sampling time dT, and the
+    Algorithm 1: backward conditionals p(y_i | y_{i+dT}) for random sampling times dT, and the
     stationary density at the last sample (eqs. 6 and 7, with the latent densities of sec. III-B
     in closed form). The backward conditional is the paper's N(F^-1 z', F^-1 Sigma F^-T): the
     reverse under a flat prior on z, not under the stationary density.
@@ -13,171 +13,118 @@ objectives are those of `ImitationFlowConfig.objective`:
 "reproduction"
     First the forward conditional likelihood p(y_{i+k} | y_i) over horizons k, log-uniform up to
     60 % of the recording. Then the reproduction itself: from a recording's first sample
-    y^(t) = h(exp(A t) h^-1(y_0)) in closed form, squared error to y(t) at random times t, with the
-    likelihood kept at a small weight. Two penalties shape the field beside the data: the tube and
-    the calm, see the configuration. Last, with the flow and A fixed, the noise is fitted by the
-    same likelihood.
+    y^(t) = h(exp(A t) h^-1(y_0)) in closed form, squared error to y(t) at random times t and at the
+    end, with the likelihood kept at a small weight. Two penalties shape the field beside the data,
+    the tube and the calm, see the configuration. Last, with the flow and A fixed, the noise is
+    fitted by the same likelihood.
+
+For a motion that repeats, "reproduction" is the forward likelihood alone, over horizons up to one
+period, with the density of the state beside it: tempo varies from round to round, and a squared
+error over a round would shrink the orbit.
 """
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
-from iflow_gym.baselines.imitation_flow.flow import CouplingFlow
-from iflow_gym.baselines.imitation_flow.latent import (
-    LinearLatent,
-    gaussian_log_prob,
-    propagator,
-    stationary_covariance,
-    transition,
+from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
+from iflow_gym.baselines.imitation_flow.emissions import make_flow
+from iflow_gym.baselines.imitation_flow.flow import Flow
+from iflow_gym.baselines.imitation_flow.guard import GuardedAdam, Restart, TrainingError
+from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
+from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
+from iflow_gym.baselines.imitation_flow.objectives import (
+    Calm,
+    backward_likelihood,
+    forward_likelihood,
+    pairs_of,
+    random_pairs,
+    reproduction,
+    stationary,
 )
-from iflow_gym.demonstrations import Demonstrations
-
-LONGEST_HORIZON = 0.6
-"""Longest horizon of the likelihood, as a fraction of the recording."""
-
-WARM_UP = 0.15
-"""Share of the steps in which the learning rate rises."""
+from iflow_gym.baselines.imitation_flow.passes import Term, encode, evaluate
 
 SQUARED_ERROR_WEIGHT = 100.0
 """Weight of the squared error, against which the penalties are measured."""
 
-MOST_DROPPED = 0.01
-"""Steps whose gradient is not finite are left out; more than this share of them is no fit."""
+N_HORIZONS = 14
+"""Sampling times in a step's likelihood."""
 
-CALM_POINTS = 32
-CALM_STEP = 0.02
-"""The calm penalty sees the mean speed over this fraction of the duration, from so many states."""
+TURNS = 2
+"""The likelihood and the tube take their turns beside the reproduction, one each in so many steps,
+with so many times the weight: that trains as well, in less time."""
 
-NOISE_STEPS = 200
-NOISE_PAIRS = 2000
-NOISE_RATE = 0.05
+N_CALM = 32
+"""States in a step's calm penalty."""
 
+LIKELIHOOD, WHOLE = 0, 1
+"""Stages: losses are of one kind within each."""
 
-class TrainingError(RuntimeError):
-    """Training did not end in finite parameters."""
+NOISE_STEPS = 100
+NOISE_HORIZONS = 100
+NOISE_PAIRS = 20
+NOISE_RATE = 0.1
 
 
 @dataclass(frozen=True)
-class Scales:
-    """Units of one motion: length per latent unit, seconds per latent time."""
+class Trained:
+    """A trained model: its place in a batch, which is on the CPU."""
 
-    length: float
-    time: float
+    flow: Flow
+    latent: Latent
+    place: int
+    restarts: list[Restart]
+    """How often training diverged and was taken back."""
 
-    @classmethod
-    def of(cls, demonstrations: Demonstrations) -> Scales:
-        """Take the largest distance from the goal along an axis, and the mean duration."""
-        offsets = np.concatenate(demonstrations.positions) - demonstrations.attractor
-        return cls(float(np.abs(offsets).max()), float(demonstrations.durations.mean()))
-
-
-class _Recordings:
-    """The demonstrations of m motions with n recordings each, as padded tensors."""
-
-    def __init__(self, motions: Sequence[Demonstrations], device: torch.device) -> None:
-        scales = [Scales.of(motion) for motion in motions]
-        n, d = len(motions[0]), motions[0].n_dims
-        lengths = np.array([[len(p) for p in motion.positions] for motion in motions])
-        padded = np.zeros((len(motions), n, lengths.max(), d), dtype=np.float32)
-        for m, (motion, scale) in enumerate(zip(motions, scales, strict=True)):
-            for i, positions in enumerate(motion.positions):
-                padded[m, i, : len(positions)] = (positions - motion.attractor) / scale.length
-        steps = np.array(
-            [[h / s.time for h in motion.dt] for motion, s in zip(motions, scales, strict=True)]
-        )
-        boxes = [
-            [(corner - motion.attractor) / s.length for corner in motion.bounding_box]
-            for motion, s in zip(motions, scales, strict=True)
-        ]
-        speeds = [m.peak_speed * s.time / s.length for m, s in zip(motions, scales, strict=True)]
-
-        def tensor(array: object) -> Tensor:
-            return torch.as_tensor(np.asarray(array, dtype=np.float32), device=device)
-
-        self.n_models, self.n_recordings, self.n_dims = len(motions), n, d
-        self.lengths = lengths
-        self.positions, self.steps, self.peak_speed = tensor(padded), tensor(steps), tensor(speeds)
-        box = tensor(boxes)
-        self.centre, self.half = box.mean(1, keepdim=True), (box[:, 1:] - box[:, :1]) / 2
-        self.device = device
-        self._models = torch.arange(len(motions), device=device)[:, None]
-
-    def at(self, recordings: NDArray[np.int64], samples: NDArray[np.int64]) -> Tensor:
-        """Positions, shape (m, k, d), of samples (m, k) of recordings (m, k)."""
-        return self.positions[self._models, self._index(recordings), self._index(samples)]
-
-    def durations(self, recordings: NDArray[np.int64], n_steps: NDArray[np.int64]) -> Tensor:
-        """Latent time, shape (m, k), of a number of steps (m, k) of recordings (m, k)."""
-        return self.steps[self._models, self._index(recordings)] * self._index(n_steps)
-
-    def _index(self, array: NDArray[np.int64]) -> Tensor:
-        return torch.tensor(array, device=self.device)
-
-
-class _Draws:
-    """Random numbers, drawn a model at a time so that a model's do not depend on its neighbours."""
-
-    def __init__(self, rngs: Sequence[np.random.Generator]) -> None:
-        self.rngs = rngs
-
-    def uniform(self, *shape: int) -> NDArray[np.float32]:
-        return np.stack([rng.random(shape, dtype=np.float32) for rng in self.rngs])
-
-    def normal(self, *shape: int) -> NDArray[np.float32]:
-        return np.stack([rng.standard_normal(shape, dtype=np.float32) for rng in self.rngs])
-
-
-class BatchedModel(nn.Module):
-    """`n_models` flows and latent systems, with the latent attractor at h^-1(goal)."""
-
-    def __init__(
-        self, config: ImitationFlowConfig, n_dims: int, generators: list[torch.Generator]
-    ) -> None:
-        super().__init__()
-        self.flow = CouplingFlow(
-            len(generators),
-            n_dims,
-            config.n_layers,
-            config.n_hidden,
-            log_scale_bound=config.log_scale_bound,
-            sharpness=config.sharpness,
-            generators=generators,
-        )
-        self.latent = LinearLatent(len(generators), n_dims, min_decay=config.min_decay)
-
-    def encode(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return z relative to the attractor (m, n, d), the attractor (m, 1, d), log |det|."""
-        goal = y.new_zeros(y.shape[0], 1, y.shape[2])
-        z, log_det = self.flow.inverse(torch.cat([y, goal], dim=1))
-        return z[:, :-1] - z[:, -1:], z[:, -1:], log_det[:, :-1]
-
-    def parameters_by_model(self) -> list[tuple[nn.Parameter, int]]:
-        """Each parameter with the dimension that counts the models."""
-        return [(p, 1) for p in self.flow.parameters()] + [(p, 0) for p in self.latent.parameters()]
+    def arrays(self, context: Tensor | None = None) -> dict[str, NDArray[np.float64]]:
+        """Return the numbers of the flow, a context (k,) folded in, and of the latent system."""
+        return {**self.flow.arrays(self.place, context), **self.latent.arrays(self.place)}
 
 
 def train(
-    config: ImitationFlowConfig,
-    motions: Sequence[Demonstrations],
-    rngs: Sequence[np.random.Generator],
-) -> BatchedModel:
-    """Train one model for each motion (all with as many recordings and dimensions) and generator.
+    config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
+) -> list[Trained]:
+    """Train one model for each task and generator; return them in their order, on the CPU.
 
-    Returns the models on the CPU; raises `TrainingError` if one is not finite. On a CPU training
-    takes one thread: its tensors are small, and threads that wait for each other made a fit ten
-    times as slow on a busy machine.
+    The tasks have as many recordings, dimensions and context numbers each, and all end or all
+    repeat. Raises `TrainingError` where training diverges again and again.
+
+    On a CPU a batch takes one thread: its tensors are small, and threads that wait for each other
+    within an operation made a fit ten times as slow on a busy machine. With more threads the models
+    are dealt out to as many batches.
     """
+    n_batches = min(config.n_threads, len(tasks))
+    dealt = [range(k, len(tasks), n_batches) for k in range(n_batches)]
+
+    stop = threading.Event()
+
+    def batch(indices: range) -> list[Trained]:
+        torch.set_num_threads(1)  # a new thread begins with the process's number
+        return _train(config, [tasks[i] for i in indices], [rngs[i] for i in indices], stop)
+
     with _one_thread():
-        return _train(config, motions, rngs)
+        if n_batches == 1:
+            batches = [batch(dealt[0])]
+        else:
+            with ThreadPoolExecutor(n_batches) as threads:
+                try:
+                    batches = list(threads.map(batch, dealt))
+                finally:
+                    stop.set()
+    order = [i for indices in dealt for i in indices]
+    models = [model for models in batches for model in models]
+    return [model for _, model in sorted(zip(order, models, strict=True), key=lambda pair: pair[0])]
 
 
 @contextmanager
@@ -192,210 +139,117 @@ def _one_thread() -> Iterator[None]:
 
 def _train(
     config: ImitationFlowConfig,
-    motions: Sequence[Demonstrations],
+    tasks: Sequence[Task],
     rngs: Sequence[np.random.Generator],
-) -> BatchedModel:
+    stop: threading.Event,
+) -> list[Trained]:
     device = torch.device(
         ("cuda" if torch.cuda.is_available() else "cpu")
         if config.device == "auto"
         else config.device
     )
-    data = _Recordings(motions, device)
-    draws = _Draws(rngs)
+    data = Recordings(tasks, device)
     generators = [torch.Generator().manual_seed(int(rng.integers(2**63))) for rng in rngs]
-    model = BatchedModel(config, data.n_dims, generators).to(device)
-    optimizer = torch.optim.Adam(
-        model.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), fused=True
+    flow = make_flow(config, data.n_dims, tasks[0].n_context, generators).to(device)
+    latent = _make_latent(config, tasks).to(device)
+    draws = Draws(rngs, _numbers_a_step(config, data), device)
+    adam = GuardedAdam(
+        [*((p, 1) for p in flow.parameters()), *((p, 0) for p in latent.parameters())],
+        [task.name for task in tasks],
+        n_steps=config.n_steps,
+        learning_rate=config.learning_rate,
+        max_norm=config.max_gradient_norm,
     )
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, config.learning_rate, total_steps=config.n_steps, pct_start=WARM_UP
-    )
-    dropped = torch.zeros(data.n_models, device=device)
-    n_likelihood = round(config.likelihood_fraction * config.n_steps)
+    calm = Calm(data, N_CALM, config.calm_speed)
     for step in range(config.n_steps):
-        if config.objective == "paper":
-            loss = _backward_likelihood(config, model, data, draws)
-        elif step < n_likelihood:
-            loss = _forward_likelihood(config, model, data, draws)
-        else:
-            loss = _reproduction(config, model, data, draws)
-            if config.likelihood_weight:
-                loss = loss + config.likelihood_weight * _forward_likelihood(
-                    config, model, data, draws
-                )
-        if config.calm_weight and config.objective == "reproduction":
-            loss = loss + config.calm_weight * _calm(config, model, data, draws)
-        optimizer.zero_grad()
-        loss.sum().backward()
-        dropped += ~_clip_gradients(model, config.max_gradient_norm)
-        optimizer.step()
-        schedule.step()
-    if config.objective == "reproduction":
-        _fit_noise(model, data, draws)
-    model = model.to("cpu")
-    lost = (dropped / config.n_steps).tolist()
-    for motion, finite, share in zip(motions, _finite(model).tolist(), lost, strict=True):
-        if not finite or share > MOST_DROPPED:
-            raise TrainingError(
-                f"ImitationFlow did not converge on {motion.name!r}: {share:.0%} of its gradients "
-                f"were not finite. Lower learning_rate (now {config.learning_rate}) or the weights."
-            )
-    return model
+        if stop.is_set():
+            raise TrainingError("Training was stopped.")
+        draws.new_step()
+        weights, terms = zip(*_terms(config, step, latent, data, draws, calm), strict=True)
+        losses = evaluate(flow, latent, data, terms)
+        loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
+        adam.step(step, _stage(config, step, data), loss)
+    adam.finish(config.n_steps)
+    if _stage(config, config.n_steps, data) == WHOLE:
+        _fit_noise(flow, latent, data, rngs)
+    flow, latent = flow.to("cpu"), latent.to("cpu")
+    return [Trained(flow, latent, m, adam.restarts[m]) for m in range(len(tasks))]
 
 
-def _random_pairs(
-    data: _Recordings, draws: _Draws, n_pairs: int, horizon: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Draw recordings, first samples and step counts, each (m, n_pairs), for horizons in (0, 1].
-
-    A horizon is where a step count lies between 1 and the longest, on a logarithmic scale.
-    """
-    uniform = draws.uniform(2, n_pairs)
-    recordings = (uniform[:, 0] * data.n_recordings).astype(np.int64)
-    lengths = np.take_along_axis(data.lengths, recordings, axis=1)
-    longest = np.maximum(LONGEST_HORIZON * lengths, 1.0)
-    steps = np.minimum(np.exp(horizon * np.log(longest)).astype(np.int64), lengths - 1)
-    first = (uniform[:, 1] * (lengths - steps)).astype(np.int64)
-    return recordings, np.minimum(first, lengths - 1 - steps), steps
+def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
+    n, d = len(tasks), tasks[0].n_dims
+    if not tasks[0].cyclic:
+        return LinearLatent(n, d, min_decay=config.min_decay)
+    latent = LimitCycleLatent(n, d, min_decay=config.min_decay)
+    # Times are in periods and the frame makes the first axes a circle (paper, sec. IV-B).
+    rates = torch.tensor([2 * math.pi * task.turns for task in tasks])
+    latent.initialise(rates, max(INITIAL_DECAY, 2 * config.min_decay), 1.0)
+    return latent
 
 
-def _encoded_pairs(
-    model: BatchedModel,
-    data: _Recordings,
-    pairs: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Latent states before and after (m, k, d), their log |det|, and the time between (m, k)."""
-    recordings, first, steps = pairs
-    y = torch.cat([data.at(recordings, first), data.at(recordings, first + steps)], dim=1)
-    z, _, log_det = model.encode(y)
-    k = recordings.shape[1]
-    times = data.durations(recordings, steps)
-    return z[:, :k], z[:, k:], log_det[:, :k], log_det[:, k:], times
+# What a step minimises --------------------------------------------------------------------
 
 
-def _forward_likelihood(
-    config: ImitationFlowConfig, model: BatchedModel, data: _Recordings, draws: _Draws
-) -> Tensor:
-    """-log p(y_{i+k} | y_i), mean over random transitions: shape (m,)."""
-    pairs = _random_pairs(data, draws, config.n_pairs, draws.uniform(config.n_pairs))
-    before, after, _, log_det, times = _encoded_pairs(model, data, pairs)
-    forward, covariance = transition(model.latent.drift(), model.latent.diffusion(), times)
-    residual = after - (forward @ before[..., None])[..., 0]
-    return -(gaussian_log_prob(residual, covariance) + log_det).mean(1)
+def _terms(
+    config: ImitationFlowConfig,
+    step: int,
+    latent: Latent,
+    data: Recordings,
+    draws: Draws,
+    calm: Calm,
+) -> list[tuple[float, Term]]:
+    """Return the weighted terms of a step."""
+    q, p = N_HORIZONS, max(1, config.n_pairs // N_HORIZONS)
+    if config.objective == "paper":
+        return [(1.0, backward_likelihood(latent, data, draws, q, p))]
+    terms: list[tuple[float, Term]] = []
+    whole = _stage(config, step, data) == WHOLE
+    turn = step % TURNS
+    weight = TURNS * config.likelihood_weight * (turn == 0) if whole else 1.0
+    if weight:
+        terms.append((weight, forward_likelihood(latent, data, draws, q, p)))
+    if data.cyclic:
+        terms.append((1.0, stationary(latent, data, draws, q * p)))
+    if whole:
+        n, weight = config.n_times, SQUARED_ERROR_WEIGHT
+        error = reproduction(data, draws, n, end_weight=config.end_weight)
+        terms.append((weight, error))
+        if config.tube_weight and turn == TURNS // 2:
+            tube = reproduction(data, draws, max(n // 2, 1), width=config.tube_width)
+            terms.append((TURNS * weight * config.tube_weight, tube))
+    if config.calm_weight:
+        terms.append((config.calm_weight, calm(draws)))
+    return terms
 
 
-def _backward_likelihood(
-    config: ImitationFlowConfig, model: BatchedModel, data: _Recordings, draws: _Draws
-) -> Tensor:
-    """Algorithm 1's loss per transition, one sampling time a step: shape (m,)."""
-    horizon = np.broadcast_to(draws.uniform(1), (data.n_models, config.n_pairs))
-    pairs = _random_pairs(data, draws, config.n_pairs, horizon)
-    before, after, log_det, _, times = _encoded_pairs(model, data, pairs)
-    drift, diffusion = model.latent.drift(), model.latent.diffusion()
-    forward, covariance = transition(drift, diffusion, times)
-    # log N(z | F^-1 z', F^-1 Sigma F^-T) = log N(z' | F z, Sigma) + log |det F|
-    residual = after - (forward @ before[..., None])[..., 0]
-    log_det_forward = torch.diagonal(drift, dim1=-2, dim2=-1).sum(-1)[:, None] * times
-    conditional = gaussian_log_prob(residual, covariance) + log_det_forward + log_det
-    everyone = np.broadcast_to(np.arange(data.n_recordings), data.lengths.shape)
-    last, _, last_log_det = model.encode(data.at(everyone, data.lengths - 1))
-    stationary = stationary_covariance(drift, diffusion)[:, None]
-    end = gaussian_log_prob(last, stationary) + last_log_det
-    n_transitions = torch.as_tensor(
-        np.maximum(data.lengths.mean(1) - pairs[2].mean(1), 1.0), dtype=end.dtype, device=end.device
-    )
-    return -(conditional.mean(1) + end.mean(1) / n_transitions)
+def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
+    """Whether a step minimises the likelihood or whole reproductions."""
+    ends = config.objective == "reproduction" and not data.cyclic
+    return WHOLE if ends and step >= config.likelihood_fraction * config.n_steps else LIKELIHOOD
 
 
-def _reproduction(
-    config: ImitationFlowConfig, model: BatchedModel, data: _Recordings, draws: _Draws
-) -> Tensor:
-    """Squared error of whole reproductions at stratified times, and the tube's: shape (m,)."""
-    n = data.n_recordings
-    everyone = np.broadcast_to(np.arange(n), (data.n_models, n))
-    starts = data.at(everyone, np.zeros_like(everyone))
-    offsets = None
-    if config.tube_weight:
-        noise = torch.as_tensor(draws.normal(n, data.n_dims), device=data.device)
-        offsets = config.tube_width * noise
-        starts = torch.cat([starts, starts + offsets], dim=1)
-    z, attractor, _ = model.encode(starts)
-    drift = model.latent.drift()
-
-    def error(z0: Tensor, n_times: int, offset: Tensor | None) -> Tensor:
-        strata = (np.arange(n_times) + draws.uniform(n_times)) / n_times
-        spans = data.lengths[:, :, None] - 1
-        samples = np.minimum(1 + (strata[:, None] * spans).astype(np.int64), spans)
-        recordings = np.broadcast_to(everyone[:, :, None], samples.shape).reshape(len(samples), -1)
-        samples = samples.reshape(len(samples), -1)
-        forward = propagator(drift, data.durations(recordings, samples)).unflatten(1, (n, n_times))
-        path = (forward @ z0[:, :, None, :, None])[..., 0].flatten(1, 2)
-        target = data.at(recordings, samples)
-        if offset is not None:
-            left = torch.as_tensor(1 - strata, device=data.device)[:, None, :, None]
-            target = target + (offset[:, :, None] * left).flatten(1, 2)
-        return (model.flow(path + attractor) - target).square().sum(-1).mean(1)
-
-    loss = error(z[:, :n], config.n_times, None)
-    if offsets is not None:
-        loss = loss + config.tube_weight * error(z[:, n:], max(config.n_times // 2, 1), offsets)
-    return SQUARED_ERROR_WEIGHT * loss
+def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:
+    """Return how many random numbers a step draws at most."""
+    n, d = data.n_recordings, data.n_dims
+    pairs = N_HORIZONS * max(1, config.n_pairs // N_HORIZONS)
+    return 2 * N_HORIZONS + 3 * pairs + 2 * config.n_times + d * n + (d + 1) * N_CALM
 
 
-def _calm(
-    config: ImitationFlowConfig, model: BatchedModel, data: _Recordings, draws: _Draws
-) -> Tensor:
-    """Mean log excess of the speed over the demonstrations' peak, in twice their box: (m,)."""
-    uniform = torch.as_tensor(draws.uniform(CALM_POINTS, data.n_dims), device=data.device)
-    y = data.centre + 2 * data.half * (2 * uniform - 1)
-    z, attractor, _ = model.encode(y)
-    step = torch.full((data.n_models, 1), CALM_STEP, device=data.device)
-    forward = propagator(model.latent.drift(), step)[:, 0]
-    moved = model.flow(z @ forward.mT + attractor) - y
-    speed = moved.square().sum(-1).add(1e-12).sqrt() / CALM_STEP
-    return torch.relu(torch.log(speed / (config.calm_speed * data.peak_speed[:, None]))).mean(1)
-
-
-def _fit_noise(model: BatchedModel, data: _Recordings, draws: _Draws) -> None:
-    """Fit K alone by the forward likelihood, in float64; the flow and A stay as they are."""
-    horizon = draws.uniform(NOISE_PAIRS)
+def _fit_noise(
+    flow: Flow, latent: Latent, data: Recordings, rngs: Sequence[np.random.Generator]
+) -> None:
+    """Fit the noise alone by the forward likelihood; the flow and the drift stay as they are."""
+    draws = Draws(rngs, NOISE_HORIZONS * (NOISE_PAIRS + 2), data.device)
+    draws.new_step()
+    latent.requires_grad_(False)
+    latent.log_noise.requires_grad_(True)
+    optimizer = torch.optim.Adam([latent.log_noise], lr=NOISE_RATE)
+    points, times = pairs_of(data, *random_pairs(data, draws, NOISE_HORIZONS, NOISE_PAIRS))
     with torch.no_grad():
-        pairs = _random_pairs(data, draws, NOISE_PAIRS, horizon)
-        before, after, _, _, times = (t.double() for t in _encoded_pairs(model, data, pairs))
-        drift = model.latent.drift().double()
-        residual = after - (propagator(drift, times) @ before[..., None])[..., 0]
-    noise = model.latent.log_noise
-    optimizer = torch.optim.Adam([noise], lr=NOISE_RATE)
+        z = encode(flow, data, points).z.unflatten(-1, (2, NOISE_HORIZONS, NOISE_PAIRS))
+    before, after = z.unbind(2)
     for _ in range(NOISE_STEPS):
-        _, covariance = transition(drift, model.latent.diffusion().double(), times)
-        loss = -gaussian_log_prob(residual, covariance).mean(1)
+        loss = -latent.transition_log_prob(before, after, times).mean((1, 2))
         optimizer.zero_grad()
         loss.sum().backward()
         optimizer.step()
-
-
-def _clip_gradients(model: BatchedModel, max_norm: float) -> Tensor:
-    """Scale each model's gradient to `max_norm` at most; drop one that is not finite.
-
-    Returns which models' gradients were finite, shape (m,).
-    """
-    gradients = [(p.grad, axis) for p, axis in model.parameters_by_model() if p.grad is not None]
-    norm = torch.stack([_over_models(g.square(), axis) for g, axis in gradients]).sum(0).sqrt()
-    finite = norm.isfinite()
-    factor = torch.where(finite, max_norm / norm.clamp_min(max_norm), torch.zeros_like(norm))
-    for gradient, axis in gradients:
-        shape = [1] * gradient.dim()
-        shape[axis] = -1
-        gradient.masked_fill_(~finite.view(shape), 0.0).mul_(factor.view(shape))
-    return finite
-
-
-def _over_models(values: Tensor, axis: int) -> Tensor:
-    return values.sum([i for i in range(values.dim()) if i != axis])
-
-
-def _finite(model: BatchedModel) -> Tensor:
-    """Whether each model's parameters are all finite, shape (m,)."""
-    return torch.stack(
-        [p.isfinite().movedim(axis, 0).flatten(1).all(1) for p, axis in model.parameters_by_model()]
-    ).all(0)

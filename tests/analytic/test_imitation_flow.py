@@ -1,247 +1,18 @@
-"""ImitationFlow against closed forms, autograd, scipy and zuko."""
+"""ImitationFlow as a whole, on motions that end and on motions that repeat."""
 
 import json
 
 import numpy as np
 import pytest
 import safetensors.numpy
-import scipy.linalg
-import torch
-import zuko
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from torch.distributions import AffineTransform
 
 from iflow_gym.baselines.imitation_flow import ImitationFlow, ImitationFlowConfig
-from iflow_gym.baselines.imitation_flow import latent as latent_module
-from iflow_gym.baselines.imitation_flow.field import NAMES, Flow, Latent
-from iflow_gym.baselines.imitation_flow.flow import CouplingFlow
-from iflow_gym.baselines.imitation_flow.latent import (
-    LinearLatent,
-    gaussian_log_prob,
-    propagator,
-    stationary_covariance,
-    transition,
-)
+from iflow_gym.baselines.imitation_flow.fields.coupling import CouplingField
 from iflow_gym.baselines.linear import StableLinear
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.metrics import box_diagonal, rmse, start_grid
-from iflow_gym.system import ModelFileError, read_model_file
-
-
-def random_flow(n_dims, n_models=1, seed=0, n_layers=4, dtype=torch.float64):
-    generators = [torch.Generator().manual_seed(seed + i) for i in range(n_models)]
-    flow = CouplingFlow(
-        n_models, n_dims, n_layers, 8, log_scale_bound=0.3, sharpness=2.0, generators=generators
-    ).to(dtype)
-    with torch.no_grad():
-        noise = torch.Generator().manual_seed(seed)
-        flow.out_weight += 0.3 * torch.randn(flow.out_weight.shape, generator=noise, dtype=dtype)
-        flow.out_bias += 0.3 * torch.randn(flow.out_bias.shape, generator=noise, dtype=dtype)
-    return flow
-
-
-def as_numpy(flow):
-    with torch.no_grad():
-        arrays = {
-            "rotation": flow.orthogonal(),
-            "hidden_weight": flow.hidden_weight,
-            "hidden_bias": flow.hidden_bias,
-            "out_weight": flow.out_weight,
-            "out_bias": flow.out_bias,
-        }
-        return Flow({k: v[:, 0].numpy() for k, v in arrays.items()}, flow.log_scale_bound)
-
-
-def random_latent(n_dims, n_models=3, seed=0):
-    latent = LinearLatent(n_models, n_dims, min_decay=0.05).double()
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for p in latent.parameters():
-            p += torch.randn(p.shape, generator=generator, dtype=p.dtype)
-    return latent
-
-
-class TestFlow:
-    @pytest.mark.parametrize("n_dims", [2, 3, 5])
-    def test_inverse_undoes_forward_and_log_det_is_the_jacobians(self, n_dims):
-        flow = random_flow(n_dims)
-        z = torch.randn(
-            1, 7, n_dims, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
-        )
-        y = flow(z)
-        back, log_det = flow.inverse(y)
-        torch.testing.assert_close(back, z, rtol=0, atol=1e-12)
-        for i in range(7):
-            jacobian = torch.autograd.functional.jacobian(
-                lambda v: flow.inverse(v[None, None])[0][0, 0], y[0, i].detach()
-            )
-            expected = torch.linalg.slogdet(jacobian).logabsdet
-            torch.testing.assert_close(log_det[0, i], expected, rtol=0, atol=1e-10)
-
-    def test_a_layer_is_zukos_affine_coupling_behind_a_rotation(self):
-        flow = random_flow(4, n_layers=1)
-        z = torch.randn(1, 5, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-
-        def conditioner(kept):
-            log_scale, shift = flow._coefficients(0, kept[None])
-            return zuko.transforms.DependentTransform(
-                AffineTransform(shift[0], torch.exp(log_scale[0])), 1
-            )
-
-        oracle = zuko.transforms.CouplingTransform(
-            conditioner, torch.tensor([True, True, False, False])
-        )
-        rotated = (z @ flow.orthogonal()[0])[0]
-        expected, log_det = oracle.call_and_ladj(rotated)
-        y = flow(z)
-        torch.testing.assert_close(y[0], expected)
-        torch.testing.assert_close(flow.inverse(y)[1][0], -log_det)
-
-    @pytest.mark.parametrize("n_dims", [2, 3, 6])
-    def test_transforms_are_orthogonal(self, n_dims):
-        rotations = random_flow(n_dims).orthogonal()
-        eye = torch.eye(n_dims, dtype=torch.float64).expand_as(rotations)
-        torch.testing.assert_close(rotations @ rotations.mT, eye, rtol=0, atol=1e-12)
-
-    @pytest.mark.parametrize("n_dims", [2, 3])
-    def test_numpy_path_is_the_torch_path(self, n_dims):
-        flow = random_flow(n_dims)
-        fast = as_numpy(flow)
-        z = np.random.default_rng(0).normal(size=(9, n_dims))
-        tangent = np.random.default_rng(1).normal(size=(9, n_dims))
-        with torch.no_grad():
-            y = flow(torch.as_tensor(z)[None])
-            back, log_det = flow.inverse(y)
-        np.testing.assert_allclose(fast.forward(z.copy()), y[0].numpy(), atol=1e-12)
-        inverse, inverse_log_det = fast.inverse(y[0].numpy())
-        np.testing.assert_allclose(inverse, back[0].numpy(), atol=1e-12)
-        np.testing.assert_allclose(inverse_log_det, log_det[0].numpy(), atol=1e-12)
-        _, expected = torch.autograd.functional.jvp(
-            lambda v: flow(v[None])[0], torch.as_tensor(z), torch.as_tensor(tangent)
-        )
-        np.testing.assert_allclose(
-            fast.push_forward(z.copy(), tangent.copy())[1], expected.detach().numpy(), atol=1e-12
-        )
-
-    def test_a_model_is_the_same_whatever_is_beside_it(self):
-        generators = [torch.Generator().manual_seed(s) for s in (9, 5)]
-        two = CouplingFlow(2, 2, 4, 8, log_scale_bound=0.3, sharpness=2.0, generators=generators)
-        alone = CouplingFlow(
-            1, 2, 4, 8, log_scale_bound=0.3, sharpness=2.0,
-            generators=[torch.Generator().manual_seed(5)],
-        )  # fmt: skip
-        for a, b in zip(alone.parameters(), two.parameters(), strict=True):
-            torch.testing.assert_close(a[:, 0], b[:, 1])
-
-    def test_far_away_every_value_is_finite_and_the_inverse_holds(self):
-        flow = as_numpy(random_flow(2, n_layers=24))
-        y = 1e3 * np.random.default_rng(0).normal(size=(50, 2))
-        z, log_det = flow.inverse(y)
-        assert np.isfinite(z).all()
-        assert np.isfinite(log_det).all()
-        np.testing.assert_allclose(flow.forward(z), y, rtol=1e-9)
-
-
-class TestLatent:
-    @given(seed=st.integers(0, 10_000), n_dims=st.integers(2, 5))
-    @settings(max_examples=30, deadline=None)
-    def test_stable_for_every_parameter(self, seed, n_dims):
-        drift = random_latent(n_dims, seed=seed).drift().detach().numpy()
-        assert np.linalg.eigvalsh(drift + drift.transpose(0, 2, 1)).max() < 0
-        assert np.linalg.eigvals(drift).real.max() < 0
-
-    @pytest.mark.parametrize(
-        "drift",
-        [
-            [[-3.0, 0.0], [0.0, -3.0]],  # equal eigenvalues
-            [[-3.0, 1.0], [-1.0, -3.0]],  # complex
-            [[-4.0, 0.5], [0.5, -0.5]],  # real
-            [[-3.0, 1e-6], [-1e-6, -3.0]],  # nearly equal
-        ],
-    )
-    def test_propagator_in_the_plane_is_the_matrix_exponential(self, drift):
-        matrix = torch.tensor([drift], dtype=torch.float64)
-        times = torch.tensor([[0.0, 1e-7, 1e-3, 0.1, 1.0, 5.0]], dtype=torch.float64)
-        expected = np.stack([scipy.linalg.expm(np.array(drift) * t) for t in times[0].numpy()])
-        np.testing.assert_allclose(propagator(matrix, times)[0].numpy(), expected, atol=1e-12)
-
-    def test_propagator_has_finite_gradients_where_eigenvalues_meet(self):
-        matrix = torch.tensor([[[-3.0, 0.0], [0.0, -3.0]]], dtype=torch.float64, requires_grad=True)
-        propagator(matrix, torch.tensor([[0.0, 0.5]], dtype=torch.float64)).sum().backward()
-        assert torch.isfinite(matrix.grad).all()
-
-    @pytest.mark.parametrize("n_dims", [2, 3])
-    def test_stationary_covariance_solves_the_lyapunov_equation(self, n_dims):
-        latent = random_latent(n_dims)
-        drift, diffusion = latent.drift().detach(), latent.diffusion().detach()
-        solved = stationary_covariance(drift, diffusion).numpy()
-        for a, q, p in zip(drift.numpy(), diffusion.numpy(), solved, strict=True):
-            np.testing.assert_allclose(p, scipy.linalg.solve_continuous_lyapunov(a, -q), atol=1e-9)
-
-    @pytest.mark.parametrize("n_dims", [2, 3])
-    def test_transition_against_van_loan_and_against_the_semigroup(self, n_dims):
-        latent = random_latent(n_dims)
-        drift, diffusion = latent.drift().detach(), latent.diffusion().detach()
-        times = torch.tensor([[0.1, 0.7, 0.8]] * 3, dtype=torch.float64)
-        forward, covariance = transition(drift, diffusion, times)
-        for m in range(3):
-            fast = Latent(drift[m].numpy(), diffusion[m].numpy())
-            for k, t in enumerate(times[m].tolist()):
-                f, c = fast.transition(t)
-                np.testing.assert_allclose(forward[m, k].numpy(), f, atol=1e-10)
-                np.testing.assert_allclose(covariance[m, k].numpy(), c, atol=1e-10)
-        # Chapman-Kolmogorov: 0.1 then 0.7 is 0.8.
-        joined = forward[:, 1] @ covariance[:, 0] @ forward[:, 1].mT + covariance[:, 1]
-        torch.testing.assert_close(joined, covariance[:, 2], rtol=1e-9, atol=1e-12)
-
-    @pytest.mark.parametrize("n_dims", [2, 3])
-    @pytest.mark.parametrize("time", [1e-4, 1e-2, 1.0, 10.0, 100.0])
-    def test_transition_over_any_horizon(self, n_dims, time):
-        """In durations: the block exponential alone is wrong by 1e10 at 10, and nan at 100."""
-        latent = random_latent(n_dims)
-        drift, diffusion = latent.drift()[0].detach().numpy(), latent.diffusion()[0]
-        diffusion = diffusion.detach().numpy()
-        stationary = scipy.linalg.solve_continuous_lyapunov(drift, -diffusion)
-        expected_forward = scipy.linalg.expm(drift * time)
-        expected = stationary - expected_forward @ stationary @ expected_forward.T
-        forward, covariance = Latent(drift, diffusion).transition(time)
-        np.testing.assert_allclose(forward, expected_forward, rtol=0, atol=1e-12)
-        error = np.abs(covariance - expected).max()
-        assert error <= 1e-9 * np.linalg.eigvalsh(expected).min()
-        np.linalg.cholesky(covariance)
-
-    def test_transition_against_simulation(self):
-        drift = np.array([[-2.0, 1.0], [-1.0, -3.0]])
-        root = np.diag([0.5, 1.0])
-        rng = np.random.default_rng(0)
-        z, dt = np.tile([1.0, -0.5], (40_000, 1)), 0.002
-        for _ in range(250):  # Euler-Maruyama
-            z = z + dt * z @ drift.T + np.sqrt(dt) * rng.standard_normal(z.shape) @ root.T
-        forward, covariance = Latent(drift, root @ root.T).transition(0.5)
-        np.testing.assert_allclose(z.mean(0), forward @ [1.0, -0.5], atol=0.01)
-        np.testing.assert_allclose(np.cov(z.T), covariance, atol=0.01)
-
-    @pytest.mark.parametrize("n_dims", [2, 3])
-    def test_gaussian_density_against_torch(self, n_dims):
-        _, covariance = transition(
-            random_latent(n_dims).drift().detach(),
-            random_latent(n_dims).diffusion().detach(),
-            torch.full((3, 4), 0.3, dtype=torch.float64),
-        )
-        residual = torch.randn(3, 4, n_dims, dtype=torch.float64)
-        expected = torch.distributions.MultivariateNormal(
-            torch.zeros(n_dims, dtype=torch.float64), covariance
-        ).log_prob(residual)
-        torch.testing.assert_close(gaussian_log_prob(residual, covariance), expected)
-
-    def test_noise_has_a_floor(self):
-        latent = LinearLatent(1, 2, min_decay=0.05)
-        with torch.no_grad():
-            latent.log_noise.fill_(-1e4)
-        least = latent.diffusion().diagonal(dim1=-2, dim2=-1).min().item()
-        assert least == pytest.approx(latent_module.MIN_NOISE**2)
+from iflow_gym.model_files import ModelFileError, read_model_file
 
 
 @pytest.fixture(scope="module")
@@ -308,21 +79,12 @@ class TestModel:
         path = fitted.rollout(x, 50, 0.05)
         assert (np.diff(fitted.lyapunov(path), axis=1) < 0).all()
 
-    def test_inverse_error_in_single_precision_on_the_enlarged_box(self, angle):
+    def test_the_inverse_is_exact_on_the_enlarged_box(self, angle):
         system = ImitationFlow(n_steps=150).fit(angle, seed=0)
         low, high = angle.bounding_box
-        grid = (start_grid(low, high) - angle.goal) / system._length
-        exact = np.abs(system._flow.forward(system._flow.inverse(grid)[0]) - grid).max()
-        assert exact * system._length <= 1e-10 * box_diagonal(low, high)
-        for layer in system._flow.layers:
-            assert all(a.dtype == np.float64 for a in layer)
-        system._flow.layers = [
-            type(layer)(*(a.astype(np.float32) for a in layer)) for layer in system._flow.layers
-        ]
-        single = grid.astype(np.float32)
-        z = system._flow.inverse(single)[0].astype(np.float32)
-        error = np.abs(system._flow.forward(z) - single).max() * system._length
-        assert error <= 1e-4 * box_diagonal(low, high)
+        grid = start_grid(low, high)
+        error = np.abs(system._decode(system._encode(grid)[0]) - grid).max()
+        assert error <= 1e-10 * box_diagonal(low, high)
 
     def test_transition_density_integrates_to_one(self, angle, fitted):
         x, dt = np.array([-30.0, 20.0]), 0.4
@@ -360,14 +122,14 @@ class TestModel:
     @pytest.mark.parametrize(
         ("name", "change", "message"),
         [
-            ("scales", lambda a: a * [1, -1], "scales of length and time > 0"),
-            ("scales", lambda a: a * [0, 1], "scales of length and time > 0"),
-            ("scales", lambda a: a[:1], "scales of shapes"),
+            ("time", lambda a: -a, "a time > 0"),
+            ("frame", lambda a: 0 * a, "an invertible frame"),
+            ("frame", lambda a: a[:1], "frame and time of shapes"),
             ("rotation", lambda a: 1.2 * a, r"orthogonal rotations, got \|R\^T R - I\| = 0.6"),
             ("drift", lambda a: -a, "negative definite, got the eigenvalue"),
             ("drift", lambda a: a + np.diag([1e3], 1), "negative definite, got the eigenvalue"),
             ("drift", lambda a: a.astype(np.complex64), "real floating numbers in 'drift'"),
-            ("diffusion", lambda a: -a, "diffusion > 0 on the diagonal"),
+            ("diffusion", lambda a: -a, "a positive definite diffusion"),
             ("diffusion", lambda a: a + np.diag([a[0, 0]], 1), "a symmetric diffusion"),
             ("out_bias", lambda a: a + 1e200, "a flow that inverts at the goal"),
         ],
@@ -384,13 +146,13 @@ class TestModel:
             arrays["goal"] = np.zeros(3)
 
         def without_layers(header, arrays):
-            arrays.update({k: arrays[k][:0] for k in NAMES})
+            arrays.update({k: arrays[k][:0] for k in CouplingField.NAMES})
 
         def unbounded(header, arrays):
             header["config"]["log_scale_bound"] = np.inf
 
         for change, message in (
-            (in_space, r"of shapes \[\(3, 3\).*got \[\(2, 2\)"),
+            (in_space, r"of shapes \[\(3,\).*got \[\(2,\)"),
             (without_layers, "at least one layer"),
             (unbounded, "log_scale_bound > 0, got inf"),
         ):
@@ -447,7 +209,7 @@ class TestModel:
     @pytest.mark.parametrize(
         ("settings", "message"),
         [
-            ({"objective": "best"}, "objective 'reproduction' or 'paper', got 'best'"),
+            ({"objective": "best"}, "objective among 'reproduction', 'paper', got 'best'"),
             ({"n_layers": 0}, "n_layers >= 1, got 0"),
             ({"learning_rate": -1.0}, "learning_rate > 0, got -1.0"),
             ({"likelihood_fraction": 2.0}, "likelihood_fraction in"),
@@ -456,3 +218,107 @@ class TestModel:
     def test_settings_are_checked(self, settings, message):
         with pytest.raises(ValueError, match=message):
             ImitationFlow(**settings)
+
+
+def circle(n_rounds=3, radius=2.0, period=1.5, dt=0.01, clockwise=False, centre=(1.0, -2.0)):
+    """Recordings of a circle, with a closed form for everything."""
+    time = np.arange(round(n_rounds * period / dt)) * dt
+    recordings = []
+    for phase in (0.0, 1.0, 2.5):
+        angle = phase + (-1 if clockwise else 1) * 2 * np.pi * time / period
+        recordings.append(
+            np.array(centre) + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        )
+    return Demonstrations.from_arrays(recordings, dt=dt, period=period, name="circle")
+
+
+@pytest.fixture(scope="module")
+def bean():
+    """A closed curve that is no ellipse, traced with jitter, and the system that learned it."""
+    rng = np.random.default_rng(0)
+    recordings = []
+    for _ in range(4):
+        time = np.arange(600) * 0.01
+        angle = 2 * np.pi * (rng.uniform() + time / 2.0)
+        size = 1 + 0.01 * rng.standard_normal()
+        radius = size * (1 + 0.35 * np.cos(2 * angle) + 0.2 * np.sin(angle))
+        recordings.append(np.column_stack([3 * radius * np.cos(angle), radius * np.sin(angle)]))
+    motion = Demonstrations.from_arrays(recordings, dt=0.01, period=2.0, name="bean")
+    return motion, ImitationFlow(n_steps=500, n_layers=8).fit(motion, seed=0)
+
+
+class TestCycle:
+    @pytest.mark.parametrize("clockwise", [False, True])
+    def test_a_circle_is_learned_with_its_radius_centre_sense_and_period(self, clockwise):
+        motion = circle(clockwise=clockwise)
+        system = ImitationFlow(n_steps=250, n_layers=4).fit(motion, seed=0)
+        start = np.array([[4.0, 1.0]])
+        path = system.rollout(start, 1500, 0.01)[0, -450:] - [1.0, -2.0]
+        radius = np.linalg.norm(path, axis=1)
+        np.testing.assert_allclose(radius, 2.0, rtol=0.02)
+        turned = np.unwrap(np.arctan2(path[:, 1], path[:, 0]))
+        rate = (turned[-1] - turned[0]) / (449 * 0.01)
+        assert rate == pytest.approx((-1 if clockwise else 1) * 2 * np.pi / 1.5, rel=0.01)
+
+    def test_every_start_but_the_centre_ends_on_the_orbit(self, bean):
+        motion, system = bean
+        low, high = motion.bounding_box
+        starts = start_grid(low, high)
+        path = system.rollout(starts, 1600, 0.01)[:, -200:]
+        samples = np.concatenate(motion.positions)
+        steady = path[0]
+        # Every start has the same orbit, which is the recordings'.
+        for orbit in path[::16]:
+            gaps = np.linalg.norm(orbit[:, None] - steady[None], axis=2).min(axis=1)
+            assert gaps.max() < 0.02 * box_diagonal(low, high)
+        gaps = np.linalg.norm(steady[:, None] - samples[None, ::5], axis=2)
+        assert gaps.min(axis=1).mean() < 0.01 * box_diagonal(low, high)
+        assert gaps.min(axis=0).max() < 0.05 * box_diagonal(low, high)
+
+    def test_distance_to_the_cycle_decreases_everywhere(self, bean):
+        motion, system = bean
+        x = states(motion, 200)
+        value, rate = system.lyapunov(x), system.lyapunov_rate(x)
+        assert (rate <= 0).all()
+        later = system.lyapunov(system.step(x, 1e-5))
+        np.testing.assert_allclose((later - value) / 1e-5, rate, rtol=1e-2, atol=1e-4)
+        assert "cycle" in system.guarantee.reason
+
+    def test_a_step_is_the_flow_of_the_velocity(self, bean):
+        motion, system = bean
+        x = states(motion, 50)
+        slope = (system.step(x, 1e-6) - x) / 1e-6
+        np.testing.assert_allclose(system.velocity(x), slope, rtol=1e-3, atol=1e-3)
+        twice = system.step(system.step(x, 0.3), 0.5)
+        np.testing.assert_allclose(twice, system.step(x, 0.8), atol=1e-8)
+
+    def test_a_file_keeps_the_cycle(self, bean, tmp_path):
+        motion, system = bean
+        again = ImitationFlow.load(system.save(tmp_path / "bean"))
+        assert again.period_ == 2.0
+        np.testing.assert_array_equal(again.velocity(motion.starts), system.velocity(motion.starts))
+        rewrite(tmp_path / "bean", lambda header, arrays: arrays.pop("period"))
+        with pytest.raises(ModelFileError, match="no whole 'imitation-flow' model"):
+            ImitationFlow.load(tmp_path / "bean")
+
+    def test_in_space_a_tilted_cycle_is_learned_in_its_plane(self):
+        flat = circle(n_rounds=2, centre=(0.0, 0.0))
+        tilt = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -0.3]])
+        motion = Demonstrations.from_arrays([p @ tilt for p in flat.positions], dt=0.01, period=1.5)
+        system = ImitationFlow(n_steps=400, n_layers=4, sharpness=2.0).fit(motion, seed=0)
+        x, y, z = system.rollout(np.array([[3.0, 1.0, -3.0]]), 1500, 0.01)[0, -150:].T
+        np.testing.assert_allclose(np.hypot(x, y), 2.0, rtol=0.05)
+        np.testing.assert_allclose(z, 0.5 * x - 0.3 * y, atol=0.06)
+
+    def test_the_likelier_trajectory_is_the_one_that_was_learned(self, bean):
+        motion, system = bean
+        other = ImitationFlow(n_steps=250, n_layers=4).fit(circle(centre=(0.0, 0.0)), seed=0)
+        own = motion.positions[0][:300]
+        for stride in (1, 5):
+            mine = system.trajectory_log_prob(own, 0.01, stride=stride, initial=True)
+            theirs = other.trajectory_log_prob(own, 0.01, stride=stride, initial=True)
+            assert mine > theirs
+        total = sum(system.log_prob(own[:-1], own[1:], 0.01))
+        assert system.trajectory_log_prob(own, 0.01) == pytest.approx(total)
+        with pytest.raises(ValueError, match=r"a trajectory \(T, d\) of more than stride = 300"):
+            system.trajectory_log_prob(own, 0.01, stride=300)

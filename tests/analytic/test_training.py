@@ -1,48 +1,87 @@
-"""Training that goes wrong is noticed, and never returned as a fit."""
+"""Training that goes wrong is noticed, taken back, recorded, and never returned as a fit."""
 
+import numpy as np
 import pytest
 import torch
 
-from iflow_gym.baselines.imitation_flow import ImitationFlow, training
-from iflow_gym.baselines.imitation_flow.training import TrainingError
+from iflow_gym.baselines.imitation_flow import ImitationFlow, guard, training
+from iflow_gym.baselines.imitation_flow.guard import TrainingError
 from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.metrics import rmse
+
+SMALL = {"n_layers": 2, "n_times": 5, "n_pairs": 14}
 
 
-def test_gradients_that_are_not_finite_are_counted_and_refused(monkeypatch):
-    original, calls = training._reproduction, []
+def disturbed(monkeypatch, factor, when):
+    """Multiply the losses of two models by factors at the steps where `when` says so."""
+    original, calls = training.evaluate, []
 
-    def sometimes_nan(config, model, data, draws):
+    def evaluate(flow, latent, data, terms):
         calls.append(1)
-        loss = original(config, model, data, draws)
-        return loss * torch.tensor([torch.nan, 1.0]) if len(calls) % 5 == 0 else loss
+        losses = original(flow, latent, data, terms)
+        return [x * torch.tensor(factor) for x in losses] if when(len(calls)) else losses
 
-    monkeypatch.setattr(training, "_reproduction", sometimes_nan)
-    motions = [load_lasa("Angle"), load_lasa("Line")]
-    with pytest.raises(TrainingError, match=r"converge on 'LASA-Angle': 17% of its gradients"):
-        ImitationFlow(n_steps=30, n_layers=3, likelihood_fraction=0.1).fit_many(
-            motions, seeds=[0, 0]
-        )
+    monkeypatch.setattr(training, "evaluate", evaluate)
 
 
-def test_a_single_bad_step_leaves_the_other_models_alone(monkeypatch):
-    def fit():
-        return ImitationFlow(n_steps=120, n_layers=2, n_times=5, n_pairs=10).fit_many(
-            [load_lasa("Angle"), load_lasa("Line")], seeds=[0, 0]
-        )
+def fit(n_steps=120, **settings):
+    return ImitationFlow(n_steps=n_steps, **(SMALL | settings)).fit_many(
+        [load_lasa("Angle"), load_lasa("Line")], seeds=[0, 0]
+    )
 
+
+def test_a_bad_step_is_taken_back_and_leaves_the_other_models_alone(monkeypatch):
     undisturbed = fit()
-    original, calls = training._reproduction, []
-
-    def once_nan(config, model, data, draws):
-        calls.append(1)
-        loss = original(config, model, data, draws)
-        return loss * torch.tensor([torch.nan, 1.0]) if len(calls) == 9 else loss
-
-    monkeypatch.setattr(training, "_reproduction", once_nan)
-    disturbed = fit()
+    disturbed(monkeypatch, [torch.nan, 1.0], lambda n: n == 60)
+    systems = fit()
     x = [[-10.0, 5.0]]
-    assert (disturbed[1].velocity(x) == undisturbed[1].velocity(x)).all()
-    assert (disturbed[0].velocity(x) != undisturbed[0].velocity(x)).any()
+    np.testing.assert_array_equal(systems[1].velocity(x), undisturbed[1].velocity(x))
+    assert systems[1].restarts_ == []
+    assert undisturbed[0].restarts_ == []
+    (restart,) = systems[0].restarts_
+    assert restart.rate == 0.5
+    assert 60 <= restart.step < 60 + guard.WINDOW
+    assert np.isfinite(systems[0].velocity(x)).all()
+
+
+def test_a_rate_that_is_far_too_high_is_lowered_until_training_holds():
+    """At a rate of 5 the loss of a curved motion explodes; the rate is halved until it holds."""
+    untrained, system = fit(n_steps=1)[0], fit(n_steps=300, learning_rate=5.0)[0]
+    halvings = range(1, len(system.restarts_) + 1)
+    assert len(halvings) >= 1
+    assert [r.rate for r in system.restarts_] == [0.5**k for k in halvings]
+    assert error(system) < 0.5 * error(untrained)
+
+
+def error(system):
+    motion = load_lasa("Angle")
+    recordings = zip(motion.positions, motion.dt, strict=True)
+    return np.mean([rmse(p, system.rollout(p[0], len(p) - 1, h)) for p, h in recordings])
+
+
+def test_a_jump_late_in_a_window_is_not_kept_as_good():
+    """The mean of a window forgives its last step; what is kept is where that step began."""
+    parameter = torch.nn.Parameter(torch.ones(1, 1))
+    adam = guard.GuardedAdam(
+        [(parameter, 0)], ["toy"], n_steps=200, learning_rate=1e-3, max_norm=1.0
+    )
+    for step in range(2 * guard.WINDOW):
+        if step == guard.WINDOW - 1:
+            parameter.data.fill_(20.0)
+        adam.step(step, 0, parameter[:, 0] ** 2 + 1)
+    assert len(adam.restarts[0]) == 1
+    assert abs(parameter.item()) < 2
+
+
+def test_an_end_that_is_worse_than_the_beginning_is_an_error():
+    with pytest.raises(TrainingError, match="did not converge on 'LASA-Angle'"):
+        ImitationFlow(n_steps=300, learning_rate=1e8, **SMALL).fit(load_lasa("Angle"), seed=0)
+
+
+def test_training_that_diverges_for_good_is_an_error(monkeypatch):
+    disturbed(monkeypatch, [torch.nan, 1.0], lambda n: n % 5 == 0)
+    with pytest.raises(TrainingError, match=r"converge on 'LASA-Angle': its training diverged 6"):
+        fit(n_steps=400)
 
 
 @pytest.mark.parametrize("setting", ["calm_weight", "tube_weight", "likelihood_weight"])

@@ -1,0 +1,186 @@
+"""The optimizer's step, watched: a model whose training diverges is taken back and goes on slower.
+
+Models that train together share nothing, so each is judged, taken back and slowed by itself. Every
+`WINDOW` steps a model's mean and last loss are compared with the best window of its stage, which at
+first is what the stage began with. Where they are good
+the model's parameters and Adam's moments are kept; where it is far above the best, or not finite,
+they are put back, and the model's rate is halved from then on.
+
+All parameters of all models lie in one array (m, p), a row a model, of which the modules' own are
+views: what is done to each is then done in one operation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+WINDOW = 25
+"""Steps between two looks."""
+
+TOLERANCE = 30.0
+"""A window's loss may exceed the best by so much, or by so many times the best if that is more."""
+
+MOST_RESTARTS = 5
+"""A model that diverges more often is no fit."""
+
+WARM_UP = 0.15
+"""Share of the steps in which the learning rate rises."""
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class TrainingError(RuntimeError):
+    """Training diverged again and again."""
+
+
+class Restart(NamedTuple):
+    """One return to the last good state."""
+
+    step: int
+    """The step after which divergence was noticed."""
+    rate: float
+    """Fraction of the learning rate from then on."""
+
+
+class GuardedAdam:
+    """Adam with a one-cycle rate for m models at once, and an eye on each.
+
+    Parameters
+    ----------
+    parameters : sequence of (parameter, axis)
+        The axis is the dimension that counts the models. Their data become views.
+    names : sequence of str
+        The models' names, for errors.
+    n_steps : int
+    learning_rate : float
+        The peak.
+    max_norm : float
+        Each model's gradient is scaled down to this norm.
+
+    Attributes
+    ----------
+    restarts : list of m lists of Restart
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[tuple[nn.Parameter, int]],
+        names: Sequence[str],
+        *,
+        n_steps: int,
+        learning_rate: float,
+        max_norm: float,
+    ) -> None:
+        self._names, self._max_norm = list(names), max_norm
+        self._parameters, self._axes = zip(*parameters, strict=True)
+        self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
+        self._make_views()
+        self._optimizer = torch.optim.Adam(
+            [self._flat], lr=learning_rate, betas=(0.9, 0.99), fused=True
+        )
+        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self._optimizer, learning_rate, total_steps=n_steps + 1, pct_start=WARM_UP
+        )
+        like = self._flat.detach()[:, 0]
+        self._rate, self._sum = torch.ones_like(like), torch.zeros_like(like)
+        self._best, self._kept = torch.full_like(like, torch.inf), torch.full_like(like, torch.inf)
+        self._first = self._last = torch.zeros_like(like)
+        self._count, self._stage, self._slowed = 0, 0, False
+        self._good = [t.clone() for t in self._state()]
+        self.restarts: list[list[Restart]] = [[] for _ in self._names]
+
+    def step(self, step: int, stage: int, loss: Tensor) -> None:
+        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind.
+
+        Raises `TrainingError` where a model has diverged too often.
+        """
+        if stage != self._stage:
+            self.look(step)
+            self._stage = stage
+            self._best.fill_(torch.inf)
+        if bool(self._best.isinf().all()):  # a stage begins: what it has to be better than
+            self._first = loss.detach().clone()
+            self._best = torch.where(self._first.isfinite(), self._first, self._best)
+        gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
+        self._flat.grad = gradient = self._joined(
+            [torch.zeros_like(p) if g is None else g
+             for g, p in zip(gradients, self._parameters, strict=True)]
+        )  # fmt: skip
+        norm = gradient.norm(dim=1)
+        finite = norm.isfinite()
+        gradient.masked_fill_(~finite[:, None], 0.0)
+        gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm)).nan_to_num_(0.0)[:, None])
+        self._last = torch.where(finite, loss.detach(), torch.inf)
+        self._sum += self._last
+        self._count += 1
+        before = self._flat.detach().clone() if self._slowed else None
+        self._optimizer.step()
+        self._schedule.step()
+        if before is not None:
+            self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
+        if self._count == WINDOW:
+            self.look(step)
+
+    def finish(self, step: int) -> None:
+        """Look once more; raise `TrainingError` where a stage ends worse than it began."""
+        self.look(step)
+        worse = self._kept > self._first + self._first.abs().clamp_min(1.0)
+        for i in worse.nonzero()[:, 0].tolist():
+            raise TrainingError(
+                f"ImitationFlow did not converge on {self._names[i]!r}: its loss ended at "
+                f"{self._kept[i]:.3g} and was {self._first[i]:.3g} at the beginning. Lower "
+                "learning_rate or the weights."
+            )
+
+    def look(self, step: int) -> None:
+        """Judge the steps since the last look and the parameters as they are."""
+        if not self._count:
+            return
+        loss = self._sum / self._count
+        allowed = self._best + TOLERANCE * self._best.abs().clamp_min(1.0)
+        bad = ~loss.isfinite() | (loss > allowed) | (self._last > allowed)
+        bad |= ~self._flat.detach().isfinite().all(1)
+        self._best = torch.where(bad, self._best, torch.minimum(self._best, loss))
+        self._kept = torch.where(bad, self._kept, loss)
+        self._sum.zero_()
+        self._count = 0
+        if bool(bad.any()):
+            self._take_back(step, bad)
+        self._good = [t.clone() for t in self._state()]
+
+    def _take_back(self, step: int, bad: Tensor) -> None:
+        self._rate = torch.where(bad, self._rate / 2, self._rate)
+        self._slowed = True
+        for i in bad.nonzero()[:, 0].tolist():
+            self.restarts[i].append(Restart(step, float(self._rate[i])))
+            if len(self.restarts[i]) > MOST_RESTARTS:
+                raise TrainingError(
+                    f"ImitationFlow did not converge on {self._names[i]!r}: its training diverged "
+                    f"{len(self.restarts[i])} times, last at step {step} with "
+                    f"{self._rate[i]:.2g} of the learning rate. Lower learning_rate or the weights."
+                )
+        for now, kept in zip(self._state(), self._good, strict=True):
+            now.copy_(torch.where(bad[:, None], kept, now))
+
+    def _state(self) -> list[Tensor]:
+        """Return the parameters and Adam's moments, zero before the first step."""
+        state, data = self._optimizer.state[self._flat], self._flat.data
+        return [data, *(state.get(name, torch.zeros_like(data)) for name in MOMENTS)]
+
+    def _joined(self, tensors: Sequence[Tensor]) -> Tensor:
+        """Join tensors of the parameters' shapes to (m, p)."""
+        rows = [t.movedim(axis, 0) for t, axis in zip(tensors, self._axes, strict=True)]
+        return torch.cat([t.reshape(len(t), -1) for t in rows], dim=1)
+
+    def _make_views(self) -> None:
+        """Make the parameters views of the joined ones."""
+        at = 0
+        for parameter, axis in zip(self._parameters, self._axes, strict=True):
+            shape = parameter.detach().movedim(axis, 0).shape
+            size = parameter.numel() // shape[0]
+            parameter.data = self._flat.data[:, at : at + size].view(shape).movedim(0, axis)
+            at += size

@@ -1,0 +1,218 @@
+"""A chain of affine coupling layers and its gradients, written once for NumPy and for torch.
+
+Arrays are (..., d, n) with the points last; the layers' weights lead with the layer. A few models
+on a CPU run in NumPy, one after the other: these are thousands of operations on a few kilobytes
+each, which torch takes several times as long to start. Many models, and a GPU, run in torch as a
+batch. The functions are the same, `xp` is the library.
+
+Weights are R (layers, ..., d, d), W1 (layers, ..., h + 1, seen + 1) and W2 (layers, ..., 2 moved,
+h + 1). Biases are the weights of an input that is 1 and of a unit that is 1: its argument is
+`SATURATED`. The first rows of W2 give s^ / b, the others t, of
+
+    u = R z,    y_a = u_a,    y_b = u_b exp(b tanh(s^ / b)) + t.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SATURATED = 50.0
+"""An argument for which tanh is 1 and its slope 0, in any precision."""
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+
+class Weights(NamedTuple):
+    """What the chain is made of, and how it is cut."""
+
+    rotation: Array
+    hidden: Array
+    out: Array
+    n_kept: int
+    bound: float
+
+
+class Trace(NamedTuple):
+    """What a pass leaves for its gradient, by layer."""
+
+    states: Array
+    """(layers + 1, ..., d, n): before and after each layer."""
+    turned: Array
+    """(layers, ..., d, n): between the transform and the coupling."""
+    seen: Array
+    """(layers, ..., seen + 1, n): the conditioner's input."""
+    units: Array
+    """(layers, ..., h + 1, n)."""
+    squashed: Array
+    """(layers, ..., moved, n): tanh(s^ / b)."""
+    scales: Array
+    """(layers, ..., moved, n): exp(s), or exp(-s) of the inverse."""
+
+
+def forward(xp: Any, z: Array, context: Array | None, w: Weights) -> tuple[Array, Trace]:
+    """Return y = h(z), (..., d, n), and the trace."""
+    k, trace = w.n_kept, _empty_trace(xp, z, context, w)
+    out = _empty(xp, z, w.out.shape[1:-1])
+    trace.states[0] = z
+    for layer in range(len(w.rotation)):
+        u, y = trace.turned[layer], trace.states[layer + 1]
+        xp.matmul(w.rotation[layer], trace.states[layer], out=u)
+        shift, scale = _coefficients(xp, trace, w, layer, u, out, 1.0)
+        y[..., :k, :] = u[..., :k, :]
+        moved = y[..., k:, :]
+        xp.multiply(u[..., k:, :], scale, out=moved)
+        moved += shift
+    return trace.states[-1], trace
+
+
+def forward_gradient(
+    xp: Any, g: Array, trace: Trace, w: Weights
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Return the gradients of z, of the context and of R, W1, W2, from that of y."""
+    k, work = w.n_kept, _Work(xp, g, w)
+    for layer in reversed(range(len(w.rotation))):
+        u, g_b, g_u = trace.turned[layer], work.g[..., k:, :], work.g_u
+        g_moved = g_u[..., k:, :]
+        xp.multiply(g_b, trace.scales[layer], out=g_moved)
+        xp.multiply(g_moved, u[..., k:, :], out=work.g_s)
+        work.g_shift[...] = g_b
+        g_seen = work.conditioner(trace, w, layer)
+        xp.add(work.g[..., :k, :], g_seen[..., :k, :], out=g_u[..., :k, :])
+        xp.matmul(g_u, trace.states[layer].swapaxes(-1, -2), out=work.g_rotation[layer])
+        xp.matmul(w.rotation[layer].swapaxes(-1, -2), g_u, out=work.g)
+    return work.g, work.g_context, (work.g_rotation, work.g_hidden, work.g_out)
+
+
+def inverse(xp: Any, y: Array, context: Array | None, w: Weights) -> tuple[Array, Array, Trace]:
+    """Return z = h^-1(y), (..., d, n), log |det dz/dy|, (..., n), and the trace."""
+    k, trace = w.n_kept, _empty_trace(xp, y, context, w)
+    out = _empty(xp, y, w.out.shape[1:-1])
+    trace.states[-1] = y
+    for layer in reversed(range(len(w.rotation))):
+        u, y = trace.turned[layer], trace.states[layer + 1]
+        shift, shrink = _coefficients(xp, trace, w, layer, y, out, -1.0)
+        u[..., :k, :] = y[..., :k, :]
+        moved = u[..., k:, :]
+        xp.subtract(y[..., k:, :], shift, out=moved)
+        moved *= shrink
+        xp.matmul(w.rotation[layer].swapaxes(-1, -2), u, out=trace.states[layer])
+    return trace.states[0], -w.bound * trace.squashed.sum(0).sum(-2), trace
+
+
+def inverse_gradient(
+    xp: Any, g: Array, g_log_det: Array, trace: Trace, w: Weights
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Return the gradients of y, of the context and of R, W1, W2, from those of z and log |det|."""
+    k, work = w.n_kept, _Work(xp, g, w)
+    for layer in range(len(w.rotation)):
+        u, g_u = trace.turned[layer], work.g_u
+        xp.matmul(u, work.g.swapaxes(-1, -2), out=work.g_rotation[layer])
+        xp.matmul(w.rotation[layer], work.g, out=g_u)
+        g_b = g_u[..., k:, :]
+        xp.multiply(g_b, u[..., k:, :], out=work.g_s)
+        work.g_s += g_log_det[..., None, :]
+        work.g_s *= -1.0
+        g_moved = work.g[..., k:, :]
+        xp.multiply(g_b, trace.scales[layer], out=g_moved)
+        xp.multiply(g_moved, -1.0, out=work.g_shift)
+        g_seen = work.conditioner(trace, w, layer)
+        xp.add(g_u[..., :k, :], g_seen[..., :k, :], out=work.g[..., :k, :])
+    return work.g, work.g_context, (work.g_rotation, work.g_hidden, work.g_out)
+
+
+class _Work:
+    """Arrays that a gradient works in."""
+
+    def __init__(self, xp: Any, g: Array, w: Weights) -> None:
+        self.xp = xp
+        h, seen = w.hidden.shape[-2:]
+        lead, d = g.shape[:-2], g.shape[-2]
+        n_moved = d - w.n_kept
+        self.g = _empty(xp, g, (*lead, d))
+        self.g[...] = g
+        self.g_u = _empty(xp, g, (*lead, d))
+        self.g_both = _empty(xp, g, (*lead, 2 * n_moved))
+        self.g_s, self.g_shift = self.g_both[..., :n_moved, :], self.g_both[..., n_moved:, :]
+        self.g_units, self.slope = _empty(xp, g, (*lead, h)), _empty(xp, g, (*lead, h))
+        self.narrow = _empty(xp, g, (*lead, n_moved))
+        self.g_seen = _empty(xp, g, (*lead, seen))
+        self.g_context = _empty(xp, g, (*lead, seen - 1 - w.n_kept))
+        self.g_context[...] = 0
+        self.g_rotation, self.g_hidden, self.g_out = (
+            xp.empty_like(x) for x in (w.rotation, w.hidden, w.out)
+        )
+
+    def conditioner(self, trace: Trace, w: Weights, layer: int) -> Array:
+        """Take the weights' gradients from those of s and t; return that of what was seen."""
+        xp, units = self.xp, trace.units[layer]
+        squashed = trace.squashed[layer]
+        xp.multiply(squashed, squashed, out=self.narrow)
+        self.narrow -= 1.0
+        self.narrow *= -w.bound
+        self.g_s *= self.narrow
+        xp.matmul(self.g_both, units.swapaxes(-1, -2), out=self.g_out[layer])
+        xp.matmul(w.out[layer].swapaxes(-1, -2), self.g_both, out=self.g_units)
+        xp.multiply(units, units, out=self.slope)
+        self.slope -= 1.0
+        self.g_units *= self.slope  # its sign is turned below
+        xp.matmul(self.g_units, trace.seen[layer].swapaxes(-1, -2), out=self.g_hidden[layer])
+        self.g_hidden[layer] *= -1.0
+        xp.matmul(w.hidden[layer].swapaxes(-1, -2), self.g_units, out=self.g_seen)
+        self.g_seen *= -1.0
+        if self.g_context.shape[-2]:
+            self.g_context += self.g_seen[..., w.n_kept : -1, :]
+        return self.g_seen
+
+
+def _coefficients(
+    xp: Any, trace: Trace, w: Weights, layer: int, state: Array, out: Array, sign: float
+) -> tuple[Array, Array]:
+    """Fill in the trace of a layer's conditioner; return t and exp(sign s)."""
+    k, units, scale = w.n_kept, trace.units[layer], trace.scales[layer]
+    trace.seen[layer][..., :k, :] = state[..., :k, :]
+    xp.matmul(w.hidden[layer], trace.seen[layer], out=units)
+    _tanh(xp, units, units)
+    xp.matmul(w.out[layer], units, out=out)
+    n_moved = scale.shape[-2]
+    _tanh(xp, out[..., :n_moved, :], trace.squashed[layer])
+    xp.multiply(trace.squashed[layer], sign * w.bound, out=scale)
+    xp.exp(scale, out=scale)
+    return out[..., n_moved:, :], scale
+
+
+def _tanh(xp: Any, x: Array, out: Array) -> None:
+    if xp is np:
+        np.tanh(x, out=out)
+        return
+    # torch has a fast sigmoid on a CPU, and a slow tanh: tanh x = 2 sigmoid(2 x) - 1.
+    xp.multiply(x, 2.0, out=out)
+    out.sigmoid_().mul_(2.0).sub_(1.0)
+
+
+def _empty(xp: Any, like: Array, lead: tuple[int, ...]) -> Array:
+    """Return an uninitialised array (*lead, n)."""
+    shape = (*lead, like.shape[-1])
+    if xp is np:
+        return np.empty(shape, dtype=like.dtype)
+    return xp.empty(shape, dtype=like.dtype, device=like.device)
+
+
+def _empty_trace(xp: Any, z: Array, context: Array | None, w: Weights) -> Trace:
+    n_layers, (d, _) = len(w.rotation), z.shape[-2:]
+    lead, (h, n_seen) = (n_layers, *z.shape[:-2]), w.hidden.shape[-2:]
+    n_moved = d - w.n_kept
+    seen = _empty(xp, z, (*lead, n_seen))
+    seen[..., -1, :] = 1
+    if context is not None:
+        seen[..., w.n_kept : -1, :] = context
+    return Trace(
+        _empty(xp, z, (n_layers + 1, *z.shape[:-2], d)),
+        _empty(xp, z, (*lead, d)),
+        seen,
+        _empty(xp, z, (*lead, h)),
+        _empty(xp, z, (*lead, n_moved)),
+        _empty(xp, z, (*lead, n_moved)),
+    )

@@ -1,0 +1,182 @@
+"""The terms of ImitationFlow's objectives, each a generator for `passes.evaluate`.
+
+Forward likelihood, reproduction, tube and calm are the default's; backward likelihood and end are
+Algorithm 1's (paper, eqs. 6 and 7).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from iflow_gym.baselines.imitation_flow.data import Draws, Recordings
+from iflow_gym.baselines.imitation_flow.latent import Latent
+from iflow_gym.baselines.imitation_flow.passes import Points, Starts, Term
+
+LONGEST_HORIZON = 0.6
+"""Longest horizon of the likelihood, as a fraction of the recording."""
+
+CALM_STEP = 0.005
+"""The calm term sees the mean speed over this fraction of the duration."""
+
+
+def everyone(data: Recordings) -> Tensor:
+    """Return the indices of all recordings, shape (m, n)."""
+    n = data.n_recordings
+    return torch.arange(n, device=data.device).expand(data.n_models, n)
+
+
+def random_pairs(
+    data: Recordings, draws: Draws, n_horizons: int, n_pairs: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw a recording (m, q), a step count (m, q) and first samples (m, q, p) for each horizon.
+
+    The q horizons lie one in each stratum: log-uniform from one sample to `LONGEST_HORIZON` of the
+    recording where motions end, uniform up to one period where they repeat. Each has one recording,
+    so that its p pairs share one transition (Algorithm 1's sampling time).
+    """
+    recordings = (draws.uniform(n_horizons) * data.n_recordings).long()
+    lengths = torch.gather(data.lengths, 1, recordings)
+    strata = torch.arange(n_horizons, device=data.device)
+    at = (strata + draws.uniform(n_horizons)) / n_horizons
+    if data.cyclic:  # times are in periods
+        steps = (at / torch.gather(data.steps, 1, recordings)).long().clamp_min(1)
+    else:
+        longest = (LONGEST_HORIZON * lengths).clamp_min(1.0)
+        steps = torch.exp(at * torch.log(longest)).long()
+    steps = torch.minimum(steps, lengths - 1)
+    room = (lengths - steps)[..., None]
+    first = torch.minimum((draws.uniform(n_horizons, n_pairs) * room).long(), room - 1)
+    return recordings, steps, first
+
+
+def pairs_of(
+    data: Recordings, recordings: Tensor, steps: Tensor, first: Tensor
+) -> tuple[Points, Tensor]:
+    """Return both ends, (m, d, 2 q p), of the pairs, and their times (m, q)."""
+    among = recordings[..., None].expand_as(first).flatten(1)
+    first = first.flatten(1)
+    last = first + steps[..., None].expand(*steps.shape, first.shape[1] // steps.shape[1]).flatten(
+        1
+    )
+    states = torch.cat([data.at(among, first), data.at(among, last)], dim=-1)
+    times = torch.gather(data.steps, 1, recordings) * steps
+    return Points(states, among.repeat(1, 2)), times
+
+
+def forward_likelihood(
+    latent: Latent, data: Recordings, draws: Draws, n_horizons: int, n_pairs: int
+) -> Term:
+    """-log p(y_{i+k} | y_i), mean over random transitions."""
+    points, times = pairs_of(data, *random_pairs(data, draws, n_horizons, n_pairs))
+    z, log_det = yield points
+    before, after = z.unflatten(-1, (2, n_horizons, n_pairs)).unbind(2)
+    log_prob = latent.transition_log_prob(before, after, times)
+    return -(log_prob.flatten(1) + log_det.chunk(2, -1)[1]).mean(1)
+
+
+def backward_likelihood(
+    latent: Latent, data: Recordings, draws: Draws, n_horizons: int, n_pairs: int
+) -> Term:
+    """Algorithm 1's loss a transition: backward conditionals, and the stationary density."""
+    recordings, steps, first = random_pairs(data, draws, n_horizons, n_pairs)
+    pairs, times = pairs_of(data, recordings, steps, first)
+    everybody = everyone(data)
+    ends = data.at(everybody, data.lengths - 1)
+    z, log_det = yield Points(
+        torch.cat([pairs.states, ends], dim=-1), torch.cat([pairs.recordings, everybody], dim=-1)
+    )
+    n = n_horizons * n_pairs
+    before, after = z[..., : 2 * n].unflatten(-1, (2, n_horizons, n_pairs)).unbind(2)
+    conditional = latent.backward_log_prob(before, after, times).flatten(1) + log_det[:, :n]
+    end = latent.stationary_log_prob(z[..., 2 * n :]) + log_det[:, 2 * n :]
+    n_transitions = (data.lengths.float().mean(1) - steps.float().mean(1)).clamp_min(1.0)
+    return -(conditional.mean(1) + end.mean(1) / n_transitions)
+
+
+def stationary(latent: Latent, data: Recordings, draws: Draws, n_points: int) -> Term:
+    """-log density of the state in the limit, at random samples: of the radius, for a cycle."""
+    recordings = (draws.uniform(n_points) * data.n_recordings).long()
+    lengths = torch.gather(data.lengths, 1, recordings)
+    samples = torch.minimum((draws.uniform(n_points) * lengths).long(), lengths - 1)
+    z, log_det = yield Points(data.at(recordings, samples), recordings)
+    return -(latent.stationary_log_prob(z) + log_det).mean(1)
+
+
+def reproduction(
+    data: Recordings,
+    draws: Draws,
+    n_times: int,
+    *,
+    width: float | None = None,
+    end_weight: float = 0.0,
+) -> Term:
+    """Squared error of whole reproductions at stratified times.
+
+    With a width it is the tube's: starts are moved by a normal offset of that width, and the target
+    is the recording beside which the offset shrinks in proportion to the time that is left. With an
+    `end_weight` the squared error at the last sample counts by itself: the motion has to be over
+    then, which random times see too seldom.
+    """
+    n, everybody = data.n_recordings, everyone(data)
+    starts = data.at(everybody, torch.zeros_like(everybody))
+    offset = None
+    if width is not None:
+        normal = math.sqrt(2) * torch.erfinv(1.998 * draws.uniform(data.n_dims, n) - 0.999)
+        offset = width * normal
+        starts = starts + offset
+    strata = (torch.arange(n_times, device=data.device) + draws.uniform(n_times)) / n_times
+    spans = (data.lengths - 1)[..., None]
+    samples = torch.minimum(1 + (strata[:, None] * spans).long(), spans)
+    if end_weight:
+        samples = torch.cat([samples, spans], dim=-1)
+        n_times += 1
+    samples = samples.flatten(1)
+    among = everybody[..., None].expand(-1, -1, n_times).flatten(1)
+    times = torch.gather(data.steps, 1, among) * samples
+    target = data.at(among, samples)
+    if offset is not None:
+        left = 1 - strata[:, None, None]
+        target = target + (offset[..., None] * left).flatten(2)
+    z, _ = yield Points(starts, everybody)
+    made = yield Starts(z.repeat_interleave(n_times, dim=-1), times, among)
+    squares = (made - target).square().sum(1)
+    if end_weight:
+        squares = squares.unflatten(1, (n, n_times))
+        return squares[..., :-1].mean((1, 2)) + end_weight * squares[..., -1].mean(1)
+    return squares.mean(1)
+
+
+class Calm:
+    """Squared log of speed over `limit` times the recordings' peak, in twice their box.
+
+    Fast places are small: half of the states of a call are new, the others are the fastest of the
+    call before, so that a fast place is looked at until it is calm.
+    """
+
+    def __init__(self, data: Recordings, n_points: int, limit: float) -> None:
+        self._data, self._n_new, self._limit = data, n_points // 2, limit
+        self._kept: Points | None = None
+
+    def __call__(self, draws: Draws) -> Term:
+        """Return the term of one step."""
+        data = self._data
+        uniform = draws.uniform(data.n_dims, self._n_new)
+        among = (draws.uniform(self._n_new) * data.n_recordings).long()
+        points = Points(data.centre + 2 * data.half * (2 * uniform - 1), among)
+        if self._kept is not None:
+            points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
+        z, _ = yield points
+        y, among = points
+        moved = yield Starts(z, z.new_full(among.shape, CALM_STEP), among)
+        unit = CALM_STEP * self._limit * data.peak_speed
+        speed = (torch.bmm(data.frame, moved - y) / unit[..., None]).square().sum(1)
+        excess = torch.log(speed.add(1e-12)) / 2
+        fastest = excess.detach().topk(self._n_new, dim=1).indices
+        self._kept = Points(
+            torch.gather(y, 2, fastest[:, None].expand(-1, data.n_dims, -1)),
+            torch.gather(among, 1, fastest),
+        )
+        return torch.relu(excess).square().mean(1)
