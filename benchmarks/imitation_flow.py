@@ -1,6 +1,6 @@
 """ImitationFlow on LASA-26 in one run: accuracy, seconds, numerics and calm, on one thread.
 
-    python benchmarks/imitation_flow.py [--protocol generalisation] [--seed 0] [--n-steps 2400]
+    python benchmarks/imitation_flow.py [--protocol generalisation] [--seeds 0 1 2] [--n-steps 2000]
 
 Rollouts here are the closed form (`rollout`); the leaderboard's are stepped in the environment.
 Inverse error is the worst |h(h^-1(y)) - y| over a 16 x 16 grid on twice the demonstrations' box, as
@@ -14,8 +14,7 @@ import numpy as np
 import torch
 import tyro
 
-from iflow_gym.baselines.imitation_flow import ImitationFlow, ImitationFlowConfig
-from iflow_gym.baselines.imitation_flow.field import Layer
+from iflow_gym.baselines.imitation_flow import ImitationFlow, ImitationFlowConfig, kernels
 from iflow_gym.datasets.lasa import SINGLE_MOTIONS, load_lasa
 from iflow_gym.metrics import box_diagonal, dtw, frechet, rmse, start_grid
 
@@ -26,35 +25,43 @@ class Options:
 
     protocol: str = "reproduction"
     """Or "generalisation"."""
-    seed: int = 0
-    """Seed of every fit."""
-    n_steps: int = ImitationFlowConfig.n_steps
-    """Steps of training."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits, one run of all shapes each."""
+    n_steps: tuple[int, ...] = (ImitationFlowConfig.n_steps,)
+    """Steps of training; several give the curve of accuracy against seconds."""
+    calm: bool = True
+    """False leaves the calm penalty out, for comparison."""
+    n_threads: int = 1
+    """Threads that all shapes are trained on."""
 
 
 def inverse_error(system: ImitationFlow, grid: np.ndarray, dtype: type) -> float:
     """Worst |h(h^-1(y)) - y| in the motion's units, computed in `dtype` throughout."""
-    flow = system._flow
-    exact = flow.layers
-    flow.layers = [Layer(*(a.astype(dtype) for a in layer)) for layer in exact]
-    y = ((grid - system.goal_) / system._length).astype(dtype)
-    z = flow.inverse(y)[0].astype(dtype)
-    error = np.linalg.norm(flow.forward(z) - y, axis=1).max() * system._length
-    flow.layers = exact
-    return float(error)
+    p = {name: array.astype(dtype) for name, array in system._parameters.items()}
+    hidden = np.concatenate([p["hidden_weight"], p["hidden_bias"][..., None]], axis=-1)
+    one = np.zeros_like(hidden[:, :1])
+    one[..., -1] = kernels.SATURATED
+    out = np.concatenate([p["out_weight"], p["out_bias"][..., None]], axis=-1)
+    bound, n_kept = system.config.log_scale_bound, hidden.shape[-1] - 1
+    out[:, : system.n_dims_ - n_kept] /= dtype(bound)
+    weights = kernels.Weights(
+        p["rotation"], np.concatenate([hidden, one], axis=1), out, n_kept, dtype(bound)
+    )
+    y = np.ascontiguousarray(((grid - system.goal_) @ system._inverse_frame.T).T, dtype=dtype)
+    z = kernels.inverse(np, y, None, weights)[0]
+    back = kernels.forward(np, z, None, weights)[0]
+    return float(np.linalg.norm(system._frame @ (back - y), axis=0).max())
 
 
-def main() -> None:
+def measure(options: Options, seed: int, n_steps: int) -> None:
     """Fit all shapes together and print a line a shape."""
-    options = tyro.cli(Options, description=__doc__)
-    torch.set_num_threads(1)
     motions = [load_lasa(shape) for shape in SINGLE_MOTIONS]
     splits = [motion.split(options.protocol) for motion in motions]
-    began = time.perf_counter()
-    systems = ImitationFlow(n_steps=options.n_steps).fit_many(
-        [split.fit for split in splits], seeds=[options.seed] * len(motions)
-    )
-    seconds = time.perf_counter() - began
+    settings = {} if options.calm else {"calm_weight": 0.0}
+    method = ImitationFlow(n_steps=n_steps, n_threads=options.n_threads, **settings)
+    began, cpu = time.perf_counter(), time.process_time()
+    systems = method.fit_many([s.fit for s in splits], seeds=[seed] * len(motions))
+    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     print(f"{'shape':18} {'RMSE':>6} {'Fréchet':>8} {'DTW':>6} {'calm':>6}  inverse error f32, f64")
     rows = []
     for motion, split, system in zip(motions, splits, systems, strict=True):
@@ -78,7 +85,21 @@ def main() -> None:
     table = np.array(rows)
     print("{:18} {:6.2f} {:8.2f} {:6.2f} {:6.1f}".format("mean", *table.mean(0)[:4]))
     print("{:18} {:6.2f} {:8.2f} {:6.2f} {:6.1f}  {:.1e} {:.1e}".format("worst", *table.max(0)))
-    print(f"{len(motions)} shapes fitted in {seconds:.0f} s on one thread, {options}")
+    restarts = sum(len(system.restarts_) for system in systems)
+    print(
+        f"{len(motions)} shapes, {options.protocol}, seed {seed}, {n_steps} steps: {seconds:.0f} s "
+        f"({cpu:.0f} s of CPU) on {options.n_threads} threads, {restarts} restarts\n",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Measure every combination of seeds and steps."""
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(options.n_threads)
+    for n_steps in options.n_steps:
+        for seed in options.seeds:
+            measure(options, seed, n_steps)
 
 
 if __name__ == "__main__":
