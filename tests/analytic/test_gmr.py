@@ -41,7 +41,7 @@ def naive_conditional(priors, means, covariances, x):
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_the_field_is_the_conditional_expectation(d):
     mixture = random_mixture(d)
-    field = MixtureField(*mixture)
+    field = MixtureField.of_joint(*mixture)
     x = 3 * np.random.default_rng(1).normal(size=(20, d))
     for i, point in enumerate(x):
         weights, mean, covariance = naive_conditional(*mixture, point)
@@ -53,7 +53,7 @@ def test_the_field_is_the_conditional_expectation(d):
 def test_the_field_is_the_integral_of_the_joint_density():
     """d = 1: E[v | x] and p(v | x) from p(x, v) by a sum over v, without conditional formulas."""
     priors, means, covariances = random_mixture(1)
-    field = MixtureField(priors, means, covariances)
+    field = MixtureField.of_joint(priors, means, covariances)
     v = np.linspace(-60, 60, 60_001)
     for x in (-2.0, 0.5, 4.0):
         grid = np.stack([np.full_like(v, x), v], axis=1)
