@@ -20,6 +20,7 @@ METHODS = {
     "imitation-flow": "iflow_gym.baselines.imitation_flow:ImitationFlow",
     "linear": "iflow_gym.baselines.linear:StableLinear",
     "gmr": "iflow_gym.baselines.gmr:GMR",
+    "seds": "iflow_gym.baselines.seds:SEDS",
 }
 """Name to ``module:Class`` of every method, a `DynamicalSystem` whose `name` is the key."""
 
