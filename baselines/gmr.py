@@ -249,6 +249,30 @@ def fit_mixture(
     return mixture.weights_, mixture.means_ * scale, mixture.covariances_ * np.outer(scale, scale)
 
 
+def checked_mixture(
+    arrays: Mapping[str, np.ndarray[Any, Any]], d: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return priors, means and covariances from a file; raise ValueError if they are no mixture."""
+    names = ("priors", "means", "covariances")
+    priors, means, covariances = (np.asarray(arrays[k], dtype=np.float64) for k in names)
+    n, size = priors.size, 2 * d
+    expected = [(n,), (n, size), (n, size, size)]
+    came = [a.shape for a in (priors, means, covariances)]
+    if n < 1 or came != expected:
+        raise ValueError(
+            f"expected {', '.join(names)} of shapes {expected} with n >= 1, got {came}"
+        )
+    check_priors(priors)
+    check_positive_definite(covariances, "covariance")
+    return priors, means, covariances
+
+
+def check_priors(priors: FloatArray) -> None:
+    """Raise ValueError unless priors are positive and sum to 1."""
+    if not ((priors > 0).all() and abs(priors.sum() - 1) <= PRIORS_TOLERANCE):
+        raise ValueError(f"expected priors > 0 that sum to 1, got {priors}")
+
+
 def scaled_samples(x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return samples (x, v) over their scale, and that scale, shapes (n, 2 d) and (2 d,).
 
@@ -376,16 +400,5 @@ class GMR(DynamicalSystem):
         return {"priors": self.priors_, "means": self.means_, "covariances": self.covariances_}
 
     def _restore(self, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        names = ("priors", "means", "covariances")
-        priors, means, covariances = (np.asarray(arrays[k], dtype=np.float64) for k in names)
-        n, size = priors.size, 2 * self.n_dims_
-        expected = [(n,), (n, size), (n, size, size)]
-        came = [a.shape for a in (priors, means, covariances)]
-        if n < 1 or came != expected:
-            raise ValueError(
-                f"expected {', '.join(names)} of shapes {expected} with n >= 1, got {came}"
-            )
-        if not ((priors > 0).all() and abs(priors.sum() - 1) <= PRIORS_TOLERANCE):
-            raise ValueError(f"expected priors > 0 that sum to 1, got {priors}")
-        check_positive_definite(covariances, "covariance")
+        priors, means, covariances = checked_mixture(arrays, self.n_dims_)
         self._adopt(priors, means, covariances, self.goal_)

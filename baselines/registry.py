@@ -21,6 +21,7 @@ METHODS = {
     "linear": "iflow_gym.baselines.linear:StableLinear",
     "gmr": "iflow_gym.baselines.gmr:GMR",
     "seds": "iflow_gym.baselines.seds:SEDS",
+    "clf-dm": "iflow_gym.baselines.clf_dm:CLFDM",
 }
 """Name to ``module:Class`` of every method, a `DynamicalSystem` whose `name` is the key."""
 

@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from iflow_gym.baselines.gmr import PRIORS_TOLERANCE, MixtureField
+from iflow_gym.baselines.gmr import MixtureField, check_priors
 from iflow_gym.baselines.seds.config import SEDSConfig
 from iflow_gym.baselines.seds.solver import fit_stable_mixture
 from iflow_gym.demonstrations import Demonstrations, FloatArray
@@ -143,8 +143,7 @@ class SEDS(DynamicalSystem):
                 f"expected {', '.join(NAMES)} and eigenvalues of shapes {expected} with n >= 1, "
                 f"got {came}"
             )
-        if not ((priors > 0).all() and abs(priors.sum() - 1) <= PRIORS_TOLERANCE):
-            raise ValueError(f"expected priors > 0 that sum to 1, got {priors}")
+        check_priors(priors)
         check_positive_definite(spreads, "spread")
         check_positive_definite(covariances, "covariance")
         found = contraction(gains)

@@ -176,11 +176,12 @@ def _search(
     config: SEDSConfig,
     max_iterations: int,
 ) -> tuple[float, FloatArray]:
-    def value_and_gradient(t: FloatArray) -> tuple[float, FloatArray]:
+    def value_and_gradient(t: FloatArray) -> Any:
         if objective == "likelihood":
             return likelihood(t, form, samples, config.regularisation)
         return mean_square_error(t, form, samples)
 
+    method = "L-BFGS-B" if form.by_construction else config.solver
     options: dict[str, Any] = {"maxiter": max_iterations}
     extra: dict[str, Any] = {}
     if form.by_construction:
@@ -191,11 +192,11 @@ def _search(
         if config.solver == "SLSQP":
             options["ftol"] = 1e-10
     with np.errstate(over="ignore", invalid="ignore"):  # a step of the search that went too far
-        result: Any = minimize(
+        result: Any = minimize(  # type: ignore[call-overload]
             value_and_gradient,
             vector,
             jac=True,
-            method="L-BFGS-B" if form.by_construction else config.solver,
+            method=method,
             options=options,
             **extra,
         )

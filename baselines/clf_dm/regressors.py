@@ -1,0 +1,173 @@
+"""The regressors that CLF-DM corrects: velocities of offsets from the goal, and no guarantee.
+
+Each is made by a `fit_...` function, has `velocity`, and `arrays`, from which its class makes it
+again. A Gaussian process's mean and support vector regression are the same sum of kernels.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.svm import SVR
+
+from iflow_gym.baselines.clf_dm.config import CLFDMConfig
+from iflow_gym.baselines.gmr import (
+    GMRConfig,
+    MixtureField,
+    checked_mixture,
+    evenly,
+    fit_mixture,
+    scaled_samples,
+)
+from iflow_gym.demonstrations import FloatArray
+
+SVR_COST, SVR_TUBE, SVR_LENGTH = 100.0, 0.01, 0.2
+"""C, epsilon and the kernel's length, with positions and velocities of root mean square 1."""
+
+GPR_LENGTHS, GPR_NOISES = (0.05, 5.0), (1e-6, 1.0)
+"""Bounds of the length scale and of the noise's variance, in the same units."""
+
+
+class Regressor(Protocol):
+    """A field of velocities, (n, d) -> (n, d), whose numbers fit in a file."""
+
+    def velocity(self, x: FloatArray) -> FloatArray:
+        """Return velocities, shape (n, d), at offsets from the goal, shape (n, d)."""
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return what a file holds."""
+
+
+class MixtureRegressor:
+    """Gaussian mixture regression, as `GMR` does it."""
+
+    def __init__(self, priors: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
+        self._mixture = {"priors": priors, "means": means, "covariances": covariances}
+        self.field = MixtureField.of_joint(priors, means, covariances)
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]], d: int) -> MixtureRegressor:
+        """Return the regressor of a file's arrays; raise ValueError if they are no mixture."""
+        return cls(*checked_mixture(arrays, d))
+
+    def velocity(self, x: FloatArray) -> FloatArray:
+        """Return E[v | x]."""
+        return self.field.velocity(x)
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return priors, means and covariances."""
+        return dict(self._mixture)
+
+
+class KernelRegressor:
+    """v(x) = bias + sum_i w_i exp(-‖x - x_i‖² / (2 length²)).
+
+    Parameters
+    ----------
+    points : array, shape (m, d)
+    weights : array, shape (m, d)
+        In units of velocity.
+    bias : array, shape (d,)
+    length : array, shape (1,)
+    """
+
+    def __init__(
+        self, points: FloatArray, weights: FloatArray, bias: FloatArray, length: FloatArray
+    ) -> None:
+        self._numbers = {"points": points, "weights": weights, "bias": bias, "length": length}
+        # -‖x - x_i‖² / 2 = x · x_i - ‖x_i‖² / 2 - ‖x‖² / 2, with lengths in `length`.
+        self._points = (points / length).T.copy()
+        self._halves = 0.5 * (self._points**2).sum(axis=0)
+        self._weights, self._bias, self._length = weights, bias, float(length[0])
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]], d: int) -> KernelRegressor:
+        """Return the regressor of a file's arrays; raise ValueError if they do not fit."""
+        names = ("points", "weights", "bias", "length")
+        values = [np.asarray(arrays[name], dtype=np.float64) for name in names]
+        m = len(values[0]) if values[0].ndim else 0
+        expected, came = [(m, d), (m, d), (d,), (1,)], [a.shape for a in values]
+        if m < 1 or came != expected:
+            raise ValueError(
+                f"expected {', '.join(names)} of shapes {expected} with m >= 1, got {came}"
+            )
+        if not values[3][0] > 0:
+            raise ValueError(f"expected a kernel's length > 0, got {values[3][0]}")
+        return cls(*values)
+
+    def velocity(self, x: FloatArray) -> FloatArray:
+        """Return v(x)."""
+        near = x / self._length
+        kernel = near @ self._points
+        kernel -= self._halves
+        kernel -= 0.5 * (near * near).sum(axis=1, keepdims=True)
+        np.exp(kernel, out=kernel)
+        return np.asarray(kernel @ self._weights + self._bias)
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return points, weights, bias and length."""
+        return dict(self._numbers)
+
+
+CLASSES: dict[str, type[MixtureRegressor] | type[KernelRegressor]] = {
+    "gmr": MixtureRegressor,
+    "gpr": KernelRegressor,
+    "svr": KernelRegressor,
+}
+"""Name in the settings to the class that makes it of a file's arrays."""
+
+
+def fit_regressor(
+    x: FloatArray, v: FloatArray, config: CLFDMConfig, rng: np.random.Generator
+) -> Regressor:
+    """Fit the regressor that the settings name to offsets and velocities, shape (n, d) each."""
+    if config.regressor == "gmr":
+        settings = GMRConfig(
+            n_components=config.n_components, n_initialisations=config.n_initialisations
+        )
+        return MixtureRegressor(*fit_mixture(x, v, settings, rng))
+    both, scale = scaled_samples(x, v)
+    few = evenly(both, config.kernel_samples)
+    fit = _gaussian_process if config.regressor == "gpr" else _support_vectors
+    d = x.shape[1]
+    points, weights, bias, length = fit(few[:, :d], few[:, d:], rng)
+    return KernelRegressor(
+        points * scale[0], weights * scale[-1], bias * scale[-1], np.array([length * scale[0]])
+    )
+
+
+def _gaussian_process(
+    x: FloatArray, v: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Fit one process with a shared isotropic kernel; its hyperparameters by the likelihood."""
+    kernel = ConstantKernel(1.0, (1e-2, 1e2)) * RBF(0.5, GPR_LENGTHS) + WhiteKernel(
+        1e-2, GPR_NOISES
+    )
+    process = GaussianProcessRegressor(kernel, random_state=int(rng.integers(2**31)))
+    with warnings.catch_warnings():
+        # A bound that is reached is as good a hyperparameter as another.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        process.fit(x, v)
+    found = process.kernel_.k1
+    weights = found.k1.constant_value * process.alpha_.reshape(v.shape)
+    return x, weights, np.zeros(v.shape[1]), float(found.k2.length_scale)
+
+
+def _support_vectors(
+    x: FloatArray, v: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Fit one machine for each coordinate; nothing about it is random."""
+    weights, bias = np.zeros_like(v), np.zeros(v.shape[1])
+    for i in range(v.shape[1]):
+        machine = SVR(C=SVR_COST, epsilon=SVR_TUBE, gamma=0.5 / SVR_LENGTH**2).fit(x, v[:, i])
+        weights[machine.support_, i] = machine.dual_coef_[0]
+        bias[i] = float(machine.intercept_[0])
+    used = (weights != 0).any(axis=1)
+    used[0] |= not used.any()
+    return x[used], weights[used], bias, SVR_LENGTH
