@@ -201,7 +201,7 @@ def learn_energy(
     least_gain: float,
     weight: float,
     rng: np.random.Generator,
-) -> Energy:
+) -> list[Energy]:
     """Learn V: one asymmetric term after another, as long as the objective gains.
 
     Parameters
@@ -221,8 +221,8 @@ def learn_energy(
 
     Returns
     -------
-    Energy
-        Scaled so that its mean over x is 1.
+    list of Energy
+        V with 0, 1, .. terms, up to the last that gained; each scaled so that its mean over x is 1.
     """
     d = x.shape[1]
     speeds, distances = np.linalg.norm(v, axis=1), np.linalg.norm(x, axis=1)
@@ -242,16 +242,22 @@ def learn_energy(
 
     form = EnergyForm(0, d)
     best, vector = search(form.flattened(np.eye(d)[None], np.empty((0, d))), form, ITERATIONS)
+    found = [form.energy(vector)]
     for n_terms in range(1, max_terms + 1):
         roots, centres = form.roots_and_centres(vector)
         wider = EnergyForm(n_terms, d)
         starts = [_start(wider, roots, centres, x, rng, i % 2 == 0) for i in range(CANDIDATES)]
         tried = [search(start, wider, TRIAL_ITERATIONS) for start in starts]
-        value, found = search(min(tried, key=lambda t: t[0])[1], wider, ITERATIONS)
+        value, reached = search(min(tried, key=lambda t: t[0])[1], wider, ITERATIONS)
         if best - value < least_gain * (best + weight):
             break
-        best, vector, form = value, found, wider
-    energy = form.energy(vector)
+        best, vector, form = value, reached, wider
+        found.append(form.energy(vector))
+    return [_scaled(energy, x) for energy in found]
+
+
+def _scaled(energy: Energy, x: FloatArray) -> Energy:
+    """Return V over its mean at the samples."""
     scale = 1.0 / float(energy.value(x).mean())
     matrices = energy.matrices * np.sqrt(scale)
     matrices[0] *= np.sqrt(scale)

@@ -21,11 +21,14 @@ Deviations from the paper:
   goal onto the level V(x) exp(-rho dt / V(x)) wherever it lies above: V falls at every step of any
   dt, and nothing chatters. The authors' code shrinks and turns the command up to ten times, which
   promises nothing.
-- V is searched for without constraints (Cholesky factors), from several starts for each L.
+- V is searched for without constraints (Cholesky factors), from several starts for each L and for
+  several w. Of the V for every w and every L that gained, and of several mixtures, the pair is kept
+  whose reproductions of the fitted demonstrations have the least Fréchet distance to them.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -33,10 +36,14 @@ import numpy as np
 
 from iflow_gym.baselines.clf_dm.config import CLFDMConfig
 from iflow_gym.baselines.clf_dm.energy import Energy, learn_energy
-from iflow_gym.baselines.clf_dm.regressors import CLASSES, Regressor, fit_regressor
+from iflow_gym.baselines.clf_dm.regressors import CLASSES, Regressor, fit_regressors
 from iflow_gym.baselines.gmr import evenly, scaled_samples
 from iflow_gym.demonstrations import Demonstrations, FloatArray
+from iflow_gym.metrics import frechet
 from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
+
+REPRODUCTION_STEPS = 250
+"""About so many steps has a reproduction when regressors and V are chosen among."""
 
 PREFIX = "regressor."
 """Before the names of the regressor's arrays in a file."""
@@ -77,14 +84,38 @@ class CLFDM(DynamicalSystem):
         config, goal = self.config, demonstrations.attractor
         x = np.concatenate(demonstrations.positions) - goal
         v = np.concatenate(demonstrations.velocities)
-        regressor = fit_regressor(x, v, config, rng)
+        regressors = fit_regressors(x, v, config, rng)
         both, scale = scaled_samples(x, v)
         few = evenly(both, config.energy_samples)
         d = x.shape[1]
-        energy = learn_energy(
-            few[:, :d], few[:, d:], config.max_terms, config.least_gain, config.weight, rng
-        )
-        self._adopt(energy, regressor, float(scale[0]), float(scale[0] / scale[-1]), goal)
+        energies = [
+            energy
+            for weight in config.weights
+            for energy in learn_energy(
+                few[:, :d], few[:, d:], config.max_terms, config.least_gain, weight, rng
+            )
+        ]
+        length, time = float(scale[0]), float(scale[0] / scale[-1])
+        errors = []
+        pairs = list(itertools.product(energies, regressors))
+        for energy, regressor in pairs if len(pairs) > 1 else ():
+            self._adopt(energy, regressor, length, time, goal)
+            errors.append(self._reproduction_error(demonstrations))
+        best = int(np.argmin(errors)) if errors else 0
+        self._adopt(*pairs[best], length, time, goal)
+
+    def _reproduction_error(self, demonstrations: Demonstrations) -> float:
+        """Return the mean Fréchet distance of thinned reproductions to the demonstrations."""
+        longest = max(len(p) for p in demonstrations.positions)
+        every = max(1, round(longest / REPRODUCTION_STEPS))
+        dt = np.array(demonstrations.dt) * every
+        paths = [demonstrations.starts]
+        for _ in range((longest - 1) // every):
+            paths.append(self._step(paths[-1], dt))
+        made = np.stack(paths, axis=1)
+        shown = [p[::every] for p in demonstrations.positions]
+        pairs = [(p, path[: len(p)]) for p, path in zip(shown, made, strict=True)]
+        return float(np.mean([frechet(p, q) for p, q in pairs]))
 
     def _adopt(
         self,

@@ -6,8 +6,10 @@ again. A Gaussian process's mean and support vector regression are the same sum 
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,17 +20,22 @@ from sklearn.svm import SVR
 
 from iflow_gym.baselines.clf_dm.config import CLFDMConfig
 from iflow_gym.baselines.gmr import (
+    SAMPLES_PER_COMPONENT,
     GMRConfig,
     MixtureField,
     checked_mixture,
+    choose_components,
     evenly,
     fit_mixture,
     scaled_samples,
 )
 from iflow_gym.demonstrations import FloatArray
 
-SVR_COST, SVR_TUBE, SVR_LENGTH = 100.0, 0.01, 0.2
-"""C, epsilon and the kernel's length, with positions and velocities of root mean square 1."""
+SVR_TUBE = 0.02
+"""epsilon, with positions and velocities of root mean square 1."""
+
+SVR_COSTS, SVR_LENGTHS = (10.0, 1000.0), (0.25, 0.5, 1.0)
+"""C, and the kernel's length in the same units: all pairs are tried."""
 
 GPR_LENGTHS, GPR_NOISES = (0.05, 5.0), (1e-6, 1.0)
 """Bounds of the length scale and of the noise's variance, in the same units."""
@@ -123,23 +130,57 @@ CLASSES: dict[str, type[MixtureRegressor] | type[KernelRegressor]] = {
 """Name in the settings to the class that makes it of a file's arrays."""
 
 
-def fit_regressor(
+MORE_COMPONENTS = (0, 4, 8)
+"""Added to the number of Gaussians that BIC chooses."""
+
+
+def fit_regressors(
     x: FloatArray, v: FloatArray, config: CLFDMConfig, rng: np.random.Generator
-) -> Regressor:
-    """Fit the regressor that the settings name to offsets and velocities, shape (n, d) each."""
+) -> list[Regressor]:
+    """Fit the regressors that the settings ask for to offsets and velocities, shape (n, d) each.
+
+    Of a mixture there are several: BIC and the likelihood choose among densities of samples, and
+    say little about which field leads along the demonstrations.
+    """
     if config.regressor == "gmr":
-        settings = GMRConfig(
-            n_components=config.n_components, n_initialisations=config.n_initialisations
-        )
-        return MixtureRegressor(*fit_mixture(x, v, settings, rng))
+        return _mixtures(x, v, config, rng)
     both, scale = scaled_samples(x, v)
     few = evenly(both, config.kernel_samples)
-    fit = _gaussian_process if config.regressor == "gpr" else _support_vectors
     d = x.shape[1]
-    points, weights, bias, length = fit(few[:, :d], few[:, d:], rng)
-    return KernelRegressor(
-        points * scale[0], weights * scale[-1], bias * scale[-1], np.array([length * scale[0]])
+    found = (
+        [_gaussian_process(few[:, :d], few[:, d:], rng)]
+        if config.regressor == "gpr"
+        else [
+            _support_vectors(few[:, :d], few[:, d:], cost, length)
+            for cost, length in itertools.product(SVR_COSTS, SVR_LENGTHS)
+        ]
     )
+    return [
+        KernelRegressor(
+            points * scale[0], weights * scale[-1], bias * scale[-1], np.array([length * scale[0]])
+        )
+        for points, weights, bias, length in found
+    ]
+
+
+def _mixtures(
+    x: FloatArray, v: FloatArray, config: CLFDMConfig, rng: np.random.Generator
+) -> list[Regressor]:
+    """Fit mixtures of several numbers of Gaussians, each from several starts."""
+    settings = GMRConfig(n_initialisations=1)
+    numbers: list[int] = []
+    if config.n_components is not None:
+        numbers = [config.n_components]
+    else:
+        both, _ = scaled_samples(x, v)
+        least = choose_components(both, settings, int(rng.integers(2**31)))
+        most = max(least, len(both) // SAMPLES_PER_COMPONENT)
+        numbers = [n for more in MORE_COMPONENTS if (n := least + more) <= most]
+    return [
+        MixtureRegressor(*fit_mixture(x, v, replace(settings, n_components=n), rng))
+        for n in numbers
+        for _ in range(config.n_initialisations)
+    ]
 
 
 def _gaussian_process(
@@ -160,14 +201,14 @@ def _gaussian_process(
 
 
 def _support_vectors(
-    x: FloatArray, v: FloatArray, rng: np.random.Generator
+    x: FloatArray, v: FloatArray, cost: float, length: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Fit one machine for each coordinate; nothing about it is random."""
+    """Fit one machine for each coordinate."""
     weights, bias = np.zeros_like(v), np.zeros(v.shape[1])
     for i in range(v.shape[1]):
-        machine = SVR(C=SVR_COST, epsilon=SVR_TUBE, gamma=0.5 / SVR_LENGTH**2).fit(x, v[:, i])
+        machine = SVR(C=cost, epsilon=SVR_TUBE, gamma=0.5 / length**2).fit(x, v[:, i])
         weights[machine.support_, i] = machine.dual_coef_[0]
         bias[i] = float(machine.intercept_[0])
     used = (weights != 0).any(axis=1)
     used[0] |= not used.any()
-    return x[used], weights[used], bias, SVR_LENGTH
+    return x[used], weights[used], bias, length
