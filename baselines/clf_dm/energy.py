@@ -31,6 +31,9 @@ TRIAL_ITERATIONS, ITERATIONS = 60, 500
 LEAST_SPEED = 0.05
 """Of the fastest sample: a hand that hesitates has no direction to learn from."""
 
+LEAST_LEFT = 1e-3
+"""Of w: nearer than this to -w, there is nothing left to gain but rounding."""
+
 NEWTON_STEPS = 60
 """At most; two or three are usual."""
 
@@ -249,7 +252,7 @@ def learn_energy(
         starts = [_start(wider, roots, centres, x, rng, i % 2 == 0) for i in range(CANDIDATES)]
         tried = [search(start, wider, TRIAL_ITERATIONS) for start in starts]
         value, reached = search(min(tried, key=lambda t: t[0])[1], wider, ITERATIONS)
-        if best - value < least_gain * (best + weight):
+        if best - value < least_gain * max(best + weight, LEAST_LEFT * weight):
             break
         best, vector, form = value, reached, wider
         found.append(form.energy(vector))

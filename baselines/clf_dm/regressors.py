@@ -87,6 +87,7 @@ class KernelRegressor:
     def __init__(
         self, points: FloatArray, weights: FloatArray, bias: FloatArray, length: FloatArray
     ) -> None:
+        weights = np.ascontiguousarray(weights)  # the layout decides how a product rounds
         self._numbers = {"points": points, "weights": weights, "bias": bias, "length": length}
         # -‖x - x_i‖² / 2 = x · x_i - ‖x_i‖² / 2 - ‖x‖² / 2, with lengths in `length`.
         self._points = (points / length).T.copy()
