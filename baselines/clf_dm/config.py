@@ -17,8 +17,8 @@ class CLFDMConfig:
     """What estimates the velocity before it is corrected: a Gaussian mixture, a Gaussian process,
     or support vector machines."""
     n_components: int | None = None
-    """Gaussians of the mixture; None tries the number of least BIC, and two and four more."""
-    n_initialisations: int = 3
+    """Gaussians of the mixture; None tries the number of least BIC, and four and eight more."""
+    n_initialisations: int = 6
     """Mixtures, from different starts of EM, that are tried for each number of Gaussians."""
     kernel_samples: int = 400
     """Samples, evenly taken, that a Gaussian process or support vector machine is fitted on."""
@@ -28,9 +28,9 @@ class CLFDMConfig:
     least_gain: float = 0.02
     """A further term is kept if it brings the objective nearer to the least that it could be, -w,
     by this fraction of the way."""
-    weights: tuple[float, ...] = (0.01, 0.1)
-    """Values of w, what steeper descent along the demonstrations is worth beside a violation. All
-    are tried. The authors' 1e-4 leaves V so flat along the demonstrations that more is corrected
+    weight: float = 0.2
+    """w of the objective: what steeper descent along the demonstrations is worth beside a
+    violation. The authors' 1e-4 leaves V so flat along the demonstrations that more is corrected
     beside them."""
     energy_samples: int = 1000
     """Samples, evenly taken, that V is learned from."""
@@ -58,8 +58,6 @@ class CLFDMConfig:
         ):
             if getattr(self, name) < least:
                 raise ValueError(f"Expected {name} >= {least}, got {getattr(self, name)}.")
-        if not self.weights or min(self.weights) <= 0:
-            raise ValueError(f"Expected weights of at least one number > 0, got {self.weights}.")
-        for name in ("least_gain", "rho0", "kappa0"):
+        for name in ("least_gain", "weight", "rho0", "kappa0"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"Expected {name} > 0, got {getattr(self, name)}.")

@@ -21,9 +21,9 @@ Deviations from the paper:
   goal onto the level V(x) exp(-rho dt / V(x)) wherever it lies above: V falls at every step of any
   dt, and nothing chatters. The authors' code shrinks and turns the command up to ten times, which
   promises nothing.
-- V is searched for without constraints (Cholesky factors), from several starts for each L and for
-  several w. Of the V for every w and every L that gained, and of several mixtures, the pair is kept
-  whose reproductions of the fitted demonstrations have the least Fréchet distance to them.
+- V is searched for without constraints (Cholesky factors), from several starts for each L. Of the
+  V for every L that gained, and of several mixtures, the pair is kept whose reproductions of the
+  fitted demonstrations have the least Fréchet distance to them.
 """
 
 from __future__ import annotations
@@ -44,6 +44,9 @@ from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
 
 REPRODUCTION_STEPS = 250
 """About so many steps has a reproduction when regressors and V are chosen among."""
+
+FINALISTS = 3
+"""Regressors that are tried with every V."""
 
 PREFIX = "regressor."
 """Before the names of the regressor's arrays in a file."""
@@ -88,21 +91,23 @@ class CLFDM(DynamicalSystem):
         both, scale = scaled_samples(x, v)
         few = evenly(both, config.energy_samples)
         d = x.shape[1]
-        energies = [
-            energy
-            for weight in config.weights
-            for energy in learn_energy(
-                few[:, :d], few[:, d:], config.max_terms, config.least_gain, weight, rng
-            )
-        ]
-        length, time = float(scale[0]), float(scale[0] / scale[-1])
-        errors = []
-        pairs = list(itertools.product(energies, regressors))
-        for energy, regressor in pairs if len(pairs) > 1 else ():
-            self._adopt(energy, regressor, length, time, goal)
-            errors.append(self._reproduction_error(demonstrations))
-        best = int(np.argmin(errors)) if errors else 0
-        self._adopt(*pairs[best], length, time, goal)
+        energies = learn_energy(
+            few[:, :d], few[:, d:], config.max_terms, config.least_gain, config.weight, rng
+        )
+        scales = float(scale[0]), float(scale[0] / scale[-1])
+
+        def error(energy: Energy, regressor: Regressor) -> float:
+            self._adopt(energy, regressor, *scales, goal)
+            return self._reproduction_error(demonstrations)
+
+        if len(regressors) * len(energies) > 1:
+            # All regressors with the last V, then the best of them with every V.
+            regressors.sort(key=lambda regressor: error(energies[-1], regressor))
+            pairs = list(itertools.product(energies[::-1], regressors[:FINALISTS]))
+            pairs.sort(key=lambda pair: error(*pair))
+        else:
+            pairs = [(energies[0], regressors[0])]
+        self._adopt(*pairs[0], *scales, goal)
 
     def _reproduction_error(self, demonstrations: Demonstrations) -> float:
         """Return the mean Fréchet distance of thinned reproductions to the demonstrations."""

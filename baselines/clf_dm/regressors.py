@@ -131,6 +131,9 @@ CLASSES: dict[str, type[MixtureRegressor] | type[KernelRegressor]] = {
 """Name in the settings to the class that makes it of a file's arrays."""
 
 
+MIXTURE_SAMPLES = 2000
+"""Samples, evenly taken, that a mixture is fitted on."""
+
 MORE_COMPONENTS = (0, 4, 8)
 """Added to the number of Gaussians that BIC chooses."""
 
@@ -168,7 +171,7 @@ def _mixtures(
     x: FloatArray, v: FloatArray, config: CLFDMConfig, rng: np.random.Generator
 ) -> list[Regressor]:
     """Fit mixtures of several numbers of Gaussians, each from several starts."""
-    settings = GMRConfig(n_initialisations=1)
+    settings = GMRConfig(n_initialisations=1, fit_samples=MIXTURE_SAMPLES)
     numbers: list[int] = []
     if config.n_components is not None:
         numbers = [config.n_components]

@@ -20,9 +20,9 @@ class SEDSConfig:
     """Gaussians in the mixture; None chooses by BIC between 2 and 10."""
     n_initialisations: int = 5
     """Starts of EM, by k-means, each of which gives two starts of the solver; the best is kept."""
-    solver: Solver = "L-BFGS-B"
-    """scipy's name. L-BFGS-B searches over gains that are stable by construction; SLSQP and
-    trust-constr search over all and take the constraint, which is slower."""
+    solver: Solver = "SLSQP"
+    """scipy's name. SLSQP, an SQP as the paper's is, and trust-constr take the constraint on the
+    gains; L-BFGS-B searches over gains that are stable by construction."""
     max_iterations: int = 500
     """Iterations of the solver from the best start."""
     trial_iterations: int = 60
