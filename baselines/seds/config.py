@@ -24,9 +24,9 @@ class SEDSConfig:
     """scipy's name. SLSQP, an SQP as the paper's is, and trust-constr take the constraint on the
     gains; L-BFGS-B searches over gains that are stable by construction."""
     max_iterations: int = 500
-    """Iterations of the solver from the best start."""
+    """Iterations of the solver, from where the best trial ended."""
     trial_iterations: int = 60
-    """Iterations of the solver from every start, and for every number of Gaussians."""
+    """Iterations of L-BFGS-B from every start, and for every number of Gaussians."""
     selection_samples: int = 500
     """Samples, evenly taken, on which BIC compares the numbers of Gaussians."""
     fit_samples: int = 2000

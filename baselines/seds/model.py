@@ -7,8 +7,9 @@ models", IEEE T-RO 27(5), 2011. The estimator is eq. (8) with the constraints of
 
 which make V(x) = ‖x - x*‖² / 2 decrease everywhere (theorem 2). Deviations from the paper:
 
-- The solver is scipy's SLSQP; it leaves eigenvalues within rounding of the constraint, and gains
-  that it leaves short of it are moved to the nearest ones that keep it.
+- The solver is scipy's SLSQP, from the best of short trials by L-BFGS over gains that are stable by
+  construction (`parameters`). Gains that it leaves short of the constraint are moved to the nearest
+  ones that keep it.
 - Beside the paper's start the solver has one that keeps each Gaussian's own regression (`solver`).
 - Samples are scaled to a mean square of 1, thinned evenly, and taken to be uncertain by a small
   variance, which bounds the likelihood.

@@ -24,6 +24,9 @@ from scipy.special import logsumexp
 
 from iflow_gym.demonstrations import FloatArray
 
+LARGEST_LOG = 25.0
+"""Of a diagonal of W or U, whose inverse squares are variances over the samples' mean square."""
+
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
@@ -114,6 +117,18 @@ class Parametrisation:
             parts,
         ]
         return np.concatenate([c.ravel() for c in columns])
+
+    def bounds(self) -> list[tuple[float | None, float | None]]:
+        """Return bounds of the vector's entries for a solver: none but of logarithms' sizes.
+
+        A trial step of a solver may be absurd, and has to stay a number.
+        """
+        k = self.n_components
+        rows, columns = self._lower
+        logs = [(-LARGEST_LOG, LARGEST_LOG) if same else (None, None) for same in rows == columns]
+        free: list[tuple[float | None, float | None]] = [(None, None)]
+        before, after = k * (1 + self.n_dims), k * self.n_dims**2
+        return free * before + 2 * k * logs + free * after
 
     def pull_back(self, vector: FloatArray, gradient: Mixture) -> FloatArray:
         """Return the gradient with respect to the vector, of one with respect to the mixture.

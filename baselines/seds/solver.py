@@ -67,16 +67,21 @@ def fit_stable_mixture(
         )
     chosen = evenly(both, max(config.fit_samples, n_components))
     samples = Samples.of(chosen[:, :d], chosen[:, d:])
-    form = Parametrisation(n_components, d, config.margin, config.solver == "L-BFGS-B")
+    form = Parametrisation(n_components, d, config.margin)
     mixtures = [_expectation_maximisation(chosen, n_components, config, s) for s in seeds[1:]]
     found = [
         solve(form.vector(start), form, samples, config, config.trial_iterations)
         for mixture in mixtures
         for start in starts(mixture, config.margin, config.regularisation, samples)
     ]
-    best = min(found, key=lambda entry: entry[0])
-    _, vector = solve(best[1], form, samples, config, config.max_iterations)
-    solution = made_feasible(form.mixture(vector), config.margin)
+    value, vector = min(found, key=lambda entry: entry[0])
+    solution = form.mixture(vector)
+    if config.solver != "L-BFGS-B":
+        form = Parametrisation(n_components, d, config.margin, by_construction=False)
+        vector = form.vector(solution)
+    last, vector = solve(vector, form, samples, config, config.max_iterations)
+    if last <= value:
+        solution = made_feasible(form.mixture(vector), config.margin)
     return _in_units(solution, samples, config, scale[0], scale[-1])
 
 
@@ -191,12 +196,13 @@ def _search(
         extra["constraints"] = [constraint]
         if config.solver == "SLSQP":
             options["ftol"] = 1e-10
-    with np.errstate(over="ignore", invalid="ignore"):  # a step of the search that went too far
+    with np.errstate(all="ignore"):  # a step of the search that went too far
         result: Any = minimize(  # type: ignore[call-overload]
             value_and_gradient,
             vector,
             jac=True,
             method=method,
+            bounds=form.bounds(),
             options=options,
             **extra,
         )
