@@ -2,8 +2,11 @@
 
 docs/images/bend.png         the README's: one latent system, bent into three motions
 docs/images/environment.png  a frame of an environment, with a policy's stream lines
+docs/images/seds.png         level sets of SEDS's V over its stream lines, and where it fails
+docs/images/clf-dm.png       level sets of CLF-DM's V over its stream lines
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,9 +15,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import iflow_gym  # registers the environments
+from iflow_gym.baselines.clf_dm import CLFDM
 from iflow_gym.baselines.imitation_flow import ImitationFlow
+from iflow_gym.baselines.seds import SEDS
 from iflow_gym.datasets.lasa import load_lasa
-from iflow_gym.plotting import plot_field, plot_streamlines
+from iflow_gym.figures import reproductions
+from iflow_gym.plotting import plot_field, plot_streamlines, view
+from iflow_gym.system import DynamicalSystem
 
 IMAGES = Path(__file__).parent / "images"
 SHAPES = ("Sshape", "GShape", "Sharpc")
@@ -59,7 +66,38 @@ def environment() -> None:
     figure.savefig(IMAGES / "environment.png")
 
 
+def level_sets(method: type[DynamicalSystem], shapes: Sequence[str], name: str) -> None:
+    """Draw level sets of V over the stream lines, with the reproductions of the recordings."""
+    figure = Figure(figsize=(4.4 * len(shapes), 4.5), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    for ax, shape in zip(figure.subplots(1, len(shapes)), shapes, strict=True):
+        motion = load_lasa(shape)
+        system = method().fit(motion, seed=0)
+        plot_field(ax, system, motion, reproductions(system, motion))
+        low, high = view(motion)
+        axes = [np.linspace(a, b, 200) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes), axis=-1)
+        # Levels that share the picture out evenly: V is flat along a motion and steep beside it.
+        height = np.asarray(system.lyapunov(grid))
+        levels = np.quantile(height, np.linspace(0, 1, 26)[1:-1])
+        ax.contour(*axes, height, levels, colors="#4d4d4d", linewidths=0.7, alpha=0.75, zorder=2)
+        ax.set_title(motion.name)
+    figure.savefig(IMAGES / name, bbox_inches="tight")
+
+
+def seds() -> None:
+    """Draw SEDS on a motion that it can make, one it makes roughly, and one it cannot make."""
+    level_sets(SEDS, ("Worm", "Angle", "Sharpc"), "seds.png")
+
+
+def clf_dm() -> None:
+    """Draw CLF-DM on the same motions."""
+    level_sets(CLFDM, ("Worm", "Angle", "Sharpc"), "clf-dm.png")
+
+
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
+    seds()
+    clf_dm()
     environment()
     bend()
