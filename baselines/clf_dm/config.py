@@ -28,11 +28,11 @@ class CLFDMConfig:
     least_gain: float = 0.02
     """A further term is kept if it brings the objective nearer to the least that it could be, -w,
     by this fraction of the way."""
-    weight: float = 0.2
-    """w of the objective: what steeper descent along the demonstrations is worth beside a
-    violation. The authors' 1e-4 leaves V so flat along the demonstrations that more is corrected
-    beside them."""
-    energy_samples: int = 1000
+    weights: tuple[float, ...] = (0.01, 0.2)
+    """Values of w, what steeper descent along the demonstrations is worth beside a violation; all
+    are tried. The authors' 1e-4 leaves V so flat along the demonstrations that more is corrected
+    beside them; with much more of it violations are bought."""
+    energy_samples: int = 700
     """Samples, evenly taken, that V is learned from."""
     rho: RhoForm = "code"
     """Least rate of descent: "paper" is rho0 (1 - exp(-kappa0 |x|)), "code" is the authors' code's
@@ -58,6 +58,8 @@ class CLFDMConfig:
         ):
             if getattr(self, name) < least:
                 raise ValueError(f"Expected {name} >= {least}, got {getattr(self, name)}.")
-        for name in ("least_gain", "weight", "rho0", "kappa0"):
+        if not self.weights or min(self.weights) <= 0:
+            raise ValueError(f"Expected weights of at least one number > 0, got {self.weights}.")
+        for name in ("least_gain", "rho0", "kappa0"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"Expected {name} > 0, got {getattr(self, name)}.")

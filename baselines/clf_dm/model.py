@@ -21,8 +21,9 @@ Deviations from the paper:
   goal onto the level V(x) exp(-rho dt / V(x)) wherever it lies above: V falls at every step of any
   dt, and nothing chatters. The authors' code shrinks and turns the command up to ten times, which
   promises nothing.
-- V is searched for without constraints (Cholesky factors), from several starts for each L. Of the
-  V for every L that gained, and of several mixtures, the pair is kept whose reproductions of the
+- V is searched for without constraints (Cholesky factors), from several starts for each L and for
+  several w, each P with eigenvalues of a bounded ratio. Of the V for every w and every L that
+  gained, and of several mixtures, the pair is kept whose reproductions of the
   fitted demonstrations have the least Fréchet distance to them.
 """
 
@@ -91,9 +92,13 @@ class CLFDM(DynamicalSystem):
         both, scale = scaled_samples(x, v)
         few = evenly(both, config.energy_samples)
         d = x.shape[1]
-        energies = learn_energy(
-            few[:, :d], few[:, d:], config.max_terms, config.least_gain, config.weight, rng
-        )
+        energies = [
+            energy
+            for weight in config.weights
+            for energy in learn_energy(
+                few[:, :d], few[:, d:], config.max_terms, config.least_gain, weight, rng
+            )
+        ]
         scales = float(scale[0]), float(scale[0] / scale[-1])
 
         def error(energy: Energy, regressor: Regressor) -> float:

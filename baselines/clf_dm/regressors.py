@@ -1,7 +1,12 @@
 """The regressors that CLF-DM corrects: velocities of offsets from the goal, and no guarantee.
 
-Each is made by a `fit_...` function, has `velocity`, and `arrays`, from which its class makes it
-again. A Gaussian process's mean and support vector regression are the same sum of kernels.
+Each has `velocity`, and `arrays`, from which its class makes it again. A Gaussian process's mean
+and support vector regression are the same sum of kernels.
+
+Far from every sample a regression says nothing, and what it extrapolates may point straight up V,
+where the correction leaves no more than the least descent. There every regressor goes straight to
+the goal, -`HOMING` x, which V falls along: a mixture by one broad Gaussian more, sums of kernels by
+being fitted to what is beyond it.
 """
 
 from __future__ import annotations
@@ -41,6 +46,14 @@ GPR_LENGTHS, GPR_NOISES = (0.05, 5.0), (1e-6, 1.0)
 """Bounds of the length scale and of the noise's variance, in the same units."""
 
 
+HOMING = 1.0
+"""Rate at which a state far from the samples nears the goal, in root mean square speeds a root mean
+square distance."""
+
+BROAD_PRIOR, BROAD_SPREAD = 1e-2, 2.0
+"""Weight of the broad Gaussian, and its standard deviation in root mean square distances."""
+
+
 class Regressor(Protocol):
     """A field of velocities, (n, d) -> (n, d), whose numbers fit in a file."""
 
@@ -73,7 +86,7 @@ class MixtureRegressor:
 
 
 class KernelRegressor:
-    """v(x) = bias + sum_i w_i exp(-‖x - x_i‖² / (2 length²)).
+    """v(x) = bias - rate x + sum_i w_i exp(-‖x - x_i‖² / (2 length²)).
 
     Parameters
     ----------
@@ -81,26 +94,38 @@ class KernelRegressor:
     weights : array, shape (m, d)
         In units of velocity.
     bias : array, shape (d,)
-    length : array, shape (1,)
+    length, rate : arrays, shape (1,)
     """
 
     def __init__(
-        self, points: FloatArray, weights: FloatArray, bias: FloatArray, length: FloatArray
+        self,
+        points: FloatArray,
+        weights: FloatArray,
+        bias: FloatArray,
+        length: FloatArray,
+        rate: FloatArray,
     ) -> None:
         weights = np.ascontiguousarray(weights)  # the layout decides how a product rounds
-        self._numbers = {"points": points, "weights": weights, "bias": bias, "length": length}
+        self._numbers = {
+            "points": points,
+            "weights": weights,
+            "bias": bias,
+            "length": length,
+            "rate": rate,
+        }
         # -‖x - x_i‖² / 2 = x · x_i - ‖x_i‖² / 2 - ‖x‖² / 2, with lengths in `length`.
         self._points = (points / length).T.copy()
         self._halves = 0.5 * (self._points**2).sum(axis=0)
-        self._weights, self._bias, self._length = weights, bias, float(length[0])
+        self._weights, self._bias = weights, bias
+        self._length, self._rate = float(length[0]), float(rate[0])
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]], d: int) -> KernelRegressor:
         """Return the regressor of a file's arrays; raise ValueError if they do not fit."""
-        names = ("points", "weights", "bias", "length")
+        names = ("points", "weights", "bias", "length", "rate")
         values = [np.asarray(arrays[name], dtype=np.float64) for name in names]
         m = len(values[0]) if values[0].ndim else 0
-        expected, came = [(m, d), (m, d), (d,), (1,)], [a.shape for a in values]
+        expected, came = [(m, d), (m, d), (d,), (1,), (1,)], [a.shape for a in values]
         if m < 1 or came != expected:
             raise ValueError(
                 f"expected {', '.join(names)} of shapes {expected} with m >= 1, got {came}"
@@ -116,10 +141,10 @@ class KernelRegressor:
         kernel -= self._halves
         kernel -= 0.5 * (near * near).sum(axis=1, keepdims=True)
         np.exp(kernel, out=kernel)
-        return np.asarray(kernel @ self._weights + self._bias)
+        return np.asarray(kernel @ self._weights + (self._bias - self._rate * x))
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Return points, weights, bias and length."""
+        """Return points, weights, bias, length and rate."""
         return dict(self._numbers)
 
 
@@ -151,17 +176,23 @@ def fit_regressors(
     both, scale = scaled_samples(x, v)
     few = evenly(both, config.kernel_samples)
     d = x.shape[1]
+    beyond = few[:, d:] + HOMING * few[:, :d]
+    rate = np.array([HOMING * scale[-1] / scale[0]])
     found = (
-        [_gaussian_process(few[:, :d], few[:, d:], rng)]
+        [_gaussian_process(few[:, :d], beyond, rng)]
         if config.regressor == "gpr"
         else [
-            _support_vectors(few[:, :d], few[:, d:], cost, length)
+            _support_vectors(few[:, :d], beyond, cost, length)
             for cost, length in itertools.product(SVR_COSTS, SVR_LENGTHS)
         ]
     )
     return [
         KernelRegressor(
-            points * scale[0], weights * scale[-1], bias * scale[-1], np.array([length * scale[0]])
+            points * scale[0],
+            weights * scale[-1],
+            bias * scale[-1],
+            np.array([length * scale[0]]),
+            rate,
         )
         for points, weights, bias, length in found
     ]
@@ -181,10 +212,26 @@ def _mixtures(
         most = max(least, len(both) // SAMPLES_PER_COMPONENT)
         numbers = [n for more in MORE_COMPONENTS if (n := least + more) <= most]
     return [
-        MixtureRegressor(*fit_mixture(x, v, replace(settings, n_components=n), rng))
+        MixtureRegressor(*_homing(*fit_mixture(x, v, replace(settings, n_components=n), rng), x, v))
         for n in numbers
         for _ in range(config.n_initialisations)
     ]
+
+
+def _homing(
+    priors: FloatArray, means: FloatArray, covariances: FloatArray, x: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the mixture with a broad Gaussian about the goal, whose own field is -HOMING x."""
+    d = x.shape[1]
+    length, speed = np.sqrt(np.mean(x**2)), np.sqrt(np.mean(v**2))
+    rate = HOMING * speed / length
+    spread = (BROAD_SPREAD * length) ** 2
+    block = np.array([[spread, -rate * spread], [-rate * spread, rate**2 * spread + speed**2]])
+    return (
+        np.append((1 - BROAD_PRIOR) * priors, BROAD_PRIOR),
+        np.concatenate([means, np.zeros((1, 2 * d))]),
+        np.concatenate([covariances, np.kron(block, np.eye(d))[None]]),
+    )
 
 
 def _gaussian_process(

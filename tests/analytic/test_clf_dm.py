@@ -14,7 +14,7 @@ from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.metrics import frechet
 from iflow_gym.system import ModelFileError
 
-QUICK = {"n_components": 4, "n_initialisations": 1, "max_terms": 1, "weight": 0.1}
+QUICK = {"n_components": 4, "n_initialisations": 1, "max_terms": 1, "weights": (0.1,)}
 
 
 def random_energy(d, n_terms, seed=0):
@@ -219,7 +219,7 @@ DEGENERATE = {
 @pytest.mark.parametrize("regressor", ["gmr", "gpr", "svr"])
 def test_degenerate_demonstrations_fit(positions, regressor, tmp_path):
     demonstrations = Demonstrations.from_arrays(positions, dt=0.02)
-    settings = {"regressor": regressor, "n_initialisations": 1, "max_terms": 1, "weight": 0.1}
+    settings = {"regressor": regressor, "n_initialisations": 1, "max_terms": 1, "weights": (0.1,)}
     system = CLFDM(kernel_samples=60, **settings).fit(demonstrations, seed=0)
     box = demonstrations.bounding_box.diagonal
     x = np.random.default_rng(0).normal(size=(200, demonstrations.n_dims)) * box
@@ -235,7 +235,7 @@ BAD = {
     "rho": "mine",
     "n_components": 0,
     "max_terms": -1,
-    "weight": 0.0,
+    "weights": (),
     "rho0": 0.0,
 }
 
