@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from iflow_gym.demonstrations import FloatArray
 
 LEAST_SHARE = 0.02
-"""a in P = T Tᵀ + a tr(T Tᵀ) I: in the plane no eigenvalue is below about a fiftieth of their sum (in
+"""a in P = T Tᵀ + a tr(T Tᵀ) I: no eigenvalue in the plane is below about a fiftieth of the sum (in
 the authors' demonstration, a tenth). Without it level sets are slits, along which a state may go
 far away before V lets it return."""
 
