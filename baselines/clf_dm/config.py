@@ -18,7 +18,7 @@ class CLFDMConfig:
     or support vector machines."""
     n_components: int | None = None
     """Gaussians of the mixture; None tries the number of least BIC, and four and eight more."""
-    n_initialisations: int = 6
+    n_initialisations: int = 4
     """Mixtures, from different starts of EM, that are tried for each number of Gaussians."""
     kernel_samples: int = 400
     """Samples, evenly taken, that a Gaussian process or support vector machine is fitted on."""
@@ -41,7 +41,7 @@ class CLFDMConfig:
     """Its greatest value, in mean V of the demonstrations, or in root mean square distances from
     the goal for "code", a unit of time: the root mean square distance over the root mean square
     speed."""
-    kappa0: float = 50.0
+    kappa0: float = 500.0
     """How fast it gets there, with |x| in root mean square distances from the goal."""
 
     def __post_init__(self) -> None:

@@ -13,8 +13,10 @@ not be more than symmetric: an asymmetric one is a symmetric one with another mu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from iflow_gym.demonstrations import FloatArray
@@ -109,6 +111,11 @@ class EnergyForm:
     n_terms: int
     n_dims: int
 
+    @cached_property
+    def _lower(self) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        rows, columns = np.tril_indices(self.n_dims)
+        return rows, columns
+
     @property
     def size(self) -> int:
         """Length of the vector."""
@@ -119,7 +126,7 @@ class EnergyForm:
         """Return T, shape (L + 1, d, d), and mu, shape (L, d)."""
         n, d = self.n_terms, self.n_dims
         roots = np.zeros((n + 1, d, d))
-        rows, columns = np.tril_indices(d)
+        rows, columns = self._lower
         roots[:, rows, columns] = vector[n * d :].reshape(n + 1, -1)
         return roots, vector[: n * d].reshape(n, d)
 
@@ -132,7 +139,7 @@ class EnergyForm:
 
     def flattened(self, roots: FloatArray, centres: FloatArray) -> FloatArray:
         """Return the vector of T and mu, or of a gradient with respect to them."""
-        rows, columns = np.tril_indices(self.n_dims)
+        rows, columns = self._lower
         return np.concatenate([centres.ravel(), roots[:, rows, columns].ravel()])
 
 
@@ -170,7 +177,7 @@ def objective(
     along = 2.0 * (inner @ pull[:, :, None])[:, :, 0] * (brackets > 0)
     along[:, 0] = 0.0
     of_products = 2.0 * weights[:, :, None] * pull[:, None] + along[:, :, None] * x[:, None]
-    of_matrices = np.einsum("nli,nj->lij", of_products, x)
+    of_matrices = (of_products.reshape(len(x), -1).T @ x).reshape(roots.shape)
     of_shifts = -(weights.T @ pull) - along.T @ x
     of_centres = np.einsum("lij,lj->li", energy.matrices[1:], of_shifts[1:])
     of_matrices[1:] += of_shifts[1:, :, None] * centres[:, None]
