@@ -21,7 +21,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from sklearn.exceptions import ConvergenceWarning
@@ -79,10 +79,12 @@ class MixtureField:
     Parameters
     ----------
     priors : array, shape (K,)
-    means : array, shape (K, 2 d)
-        Of positions and velocities.
-    covariances : array, shape (K, 2 d, 2 d)
-        Positive definite.
+    centres : array, shape (K, d)
+        mu_x: means of the positions.
+    spreads : array, shape (K, d, d)
+        Sigma_xx, positive definite.
+    conditionals : tuple of arrays, shapes (K, d, d), (K, d) and (K, d, d)
+        A_k, b_k and Cov(v | x, k), as `conditional` gives them for a joint mixture.
 
     Attributes
     ----------
@@ -94,23 +96,36 @@ class MixtureField:
         Cov(v | x, k) = Sigma_vv - A_k Sigma_xv.
     """
 
-    def __init__(self, priors: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
-        d = means.shape[1] // 2
+    def __init__(
+        self,
+        priors: FloatArray,
+        centres: FloatArray,
+        spreads: FloatArray,
+        conditionals: tuple[FloatArray, FloatArray, FloatArray],
+    ) -> None:
+        d = centres.shape[1]
         self.n_dims = d
-        self.gains, self.offsets, self.conditional_covariances = conditional(means, covariances)
+        self.gains, self.offsets, self.conditional_covariances = conditionals
         # log pi_k N(x; mu_k, Sigma_k) = constant_k - ‖W_k x - w_k‖² / 2, all k in one product.
-        whitening = np.linalg.inv(np.linalg.cholesky(covariances[:, :d, :d]))
+        whitening = np.linalg.inv(np.linalg.cholesky(spreads))
         self._whitening = whitening.reshape(-1, d).T.copy()
-        self._white_means = np.einsum("kij,kj->ki", whitening, means[:, :d]).ravel()
+        self._white_means = np.einsum("kij,kj->ki", whitening, centres).ravel()
         self._constants = (
             np.log(priors)
             + np.log(np.diagonal(whitening, axis1=1, axis2=2)).sum(axis=1)
             - 0.5 * d * np.log(2 * np.pi)
         )
-        spread = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
-        self._far = FAR * float((np.linalg.norm(means[:, :d], axis=1) + spread).max())
+        spread = np.sqrt(np.trace(spreads, axis1=1, axis2=2))
+        self._far = FAR * float((np.linalg.norm(centres, axis=1) + spread).max())
         self._stacked_gains = self.gains.reshape(-1, d).T.copy()
         self._stacked_offsets = self.offsets.ravel()
+        self._flat_gains = self.gains.reshape(len(priors), d * d)
+
+    @classmethod
+    def of_joint(cls, priors: FloatArray, means: FloatArray, covariances: FloatArray) -> Self:
+        """Return the field of a joint mixture: means (K, 2 d), covariances (K, 2 d, 2 d)."""
+        d = means.shape[1] // 2
+        return cls(priors, means[:, :d], covariances[:, :d, :d], conditional(means, covariances))
 
     def log_densities(self, x: FloatArray) -> FloatArray:
         """Return log pi_k N(x; mu_k, Sigma_k), shape (n, K), of positions x, shape (n, d)."""
@@ -146,6 +161,10 @@ class MixtureField:
         """Return E[v | x], shape (n, d)."""
         return np.asarray((self.weights(x)[:, None, :] @ self.means(x))[:, 0])
 
+    def gain(self, x: FloatArray) -> FloatArray:
+        """Return sum_k h_k(x) A_k, shape (n, d, d)."""
+        return (self.weights(x) @ self._flat_gains).reshape(len(x), self.n_dims, self.n_dims)
+
     def covariance(self, x: FloatArray) -> FloatArray:
         """Return Cov(v | x), shape (n, d, d): within the Gaussians and between them."""
         h, means = self.weights(x), self.means(x)
@@ -166,6 +185,10 @@ class MixtureField:
             logs = np.log(self.weights(x)) - constants - 0.5 * squares
         top = logs.max(axis=1, keepdims=True)
         return np.asarray(top[:, 0] + np.log(np.exp(logs - top).sum(axis=1)))
+
+    def transition_log_prob(self, x: FloatArray, x_next: FloatArray, dt: float) -> FloatArray:
+        """Return log p(x_next | x), shape (n,), of the explicit Euler step with v ~ p(v | x)."""
+        return np.asarray(self.log_prob(x, (x_next - x) / dt) - self.n_dims * np.log(dt))
 
 
 def conditional(
@@ -210,14 +233,7 @@ def fit_mixture(
     Positions are divided by their root mean square and velocities by theirs, one number each, so
     that neither the unit nor a rotation changes the fit; the mixture is scaled back exactly.
     """
-    d = x.shape[1]
-    scale = np.repeat(np.sqrt([np.mean(x**2), np.mean(v**2)]), d)
-    if not (scale > 0).all():
-        raise ValueError(
-            "Expected demonstrations that move, got positions or velocities that are all zero: "
-            "leave velocities out to have them estimated from the positions."
-        )
-    samples = np.concatenate([x, v], axis=1) / scale
+    samples, scale = scaled_samples(x, v)
     seed = int(rng.integers(2**31))
     n_components = config.n_components
     if n_components is None:
@@ -226,31 +242,81 @@ def fit_mixture(
         raise ValueError(
             f"Expected at most as many Gaussians as samples, {len(samples)}, got {n_components}."
         )
-    chosen = _evenly(samples, max(config.fit_samples, n_components))
-    mixture = _expectation_maximisation(
-        chosen, n_components, config.n_initialisations, config, seed
+    chosen = evenly(samples, max(config.fit_samples, n_components))
+    mixture = expectation_maximisation(
+        chosen, n_components, config.n_initialisations, config.regularisation, seed
     )
     return mixture.weights_, mixture.means_ * scale, mixture.covariances_ * np.outer(scale, scale)
 
 
+def checked_mixture(
+    arrays: Mapping[str, np.ndarray[Any, Any]], d: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return priors, means and covariances from a file; raise ValueError if they are no mixture."""
+    names = ("priors", "means", "covariances")
+    priors, means, covariances = (np.asarray(arrays[k], dtype=np.float64) for k in names)
+    n, size = priors.size, 2 * d
+    expected = [(n,), (n, size), (n, size, size)]
+    came = [a.shape for a in (priors, means, covariances)]
+    if n < 1 or came != expected:
+        raise ValueError(
+            f"expected {', '.join(names)} of shapes {expected} with n >= 1, got {came}"
+        )
+    check_priors(priors)
+    check_positive_definite(covariances, "covariance")
+    return priors, means, covariances
+
+
+def check_priors(priors: FloatArray) -> None:
+    """Raise ValueError unless priors are positive and sum to 1."""
+    if not ((priors > 0).all() and abs(priors.sum() - 1) <= PRIORS_TOLERANCE):
+        raise ValueError(f"expected priors > 0 that sum to 1, got {priors}")
+
+
+def scaled_samples(x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return samples (x, v) over their scale, and that scale, shapes (n, 2 d) and (2 d,).
+
+    The scale is the root mean square of all positions, and that of all velocities.
+
+    Raises
+    ------
+    ValueError
+        If all positions or all velocities are zero.
+    """
+    scale = np.repeat(np.sqrt([np.mean(x**2), np.mean(v**2)]), x.shape[1])
+    if not (scale > 0).all():
+        raise ValueError(
+            "Expected demonstrations that move, got positions or velocities that are all zero: "
+            "leave velocities out to have them estimated from the positions."
+        )
+    return np.concatenate([x, v], axis=1) / scale, scale
+
+
 def choose_components(samples: FloatArray, config: GMRConfig, seed: int) -> int:
     """Return the number of Gaussians of least BIC, from 2 to 10, or as many as samples allow."""
-    few = _evenly(samples, config.selection_samples)
-    most = min(MOST_COMPONENTS, max(1, len(few) // SAMPLES_PER_COMPONENT))
-    candidates = range(min(LEAST_COMPONENTS, most), most + 1)
+    few = evenly(samples, config.selection_samples)
+    candidates = numbers_of_components(len(few))
     scores = [
-        float(_expectation_maximisation(few, k, 1, config, seed).bic(few)) for k in candidates
+        float(expectation_maximisation(few, k, 1, config.regularisation, seed).bic(few))
+        for k in candidates
     ]
     return candidates[int(np.argmin(scores))]
 
 
-def _expectation_maximisation(
-    samples: FloatArray, n_components: int, n_init: int, config: GMRConfig, seed: int
+def numbers_of_components(n_samples: int) -> range:
+    """Return the numbers of Gaussians that so many samples are ground for."""
+    most = min(MOST_COMPONENTS, max(1, n_samples // SAMPLES_PER_COMPONENT))
+    return range(min(LEAST_COMPONENTS, most), most + 1)
+
+
+def expectation_maximisation(
+    samples: FloatArray, n_components: int, n_init: int, regularisation: float, seed: int
 ) -> GaussianMixture:
+    """Return the likeliest mixture of EM from `n_init` starts by k-means."""
     mixture = GaussianMixture(
         n_components,
         n_init=n_init,
-        reg_covar=config.regularisation,
+        reg_covar=regularisation,
         random_state=seed,
         max_iter=200,
     )
@@ -261,7 +327,7 @@ def _expectation_maximisation(
         return mixture.fit(samples)
 
 
-def _evenly(samples: FloatArray, n: int) -> FloatArray:
+def evenly(samples: FloatArray, n: int) -> FloatArray:
     """Return every k-th sample, at most about n of them."""
     return samples[:: max(1, round(len(samples) / n))]
 
@@ -312,15 +378,14 @@ class GMR(DynamicalSystem):
         self, priors: FloatArray, means: FloatArray, covariances: FloatArray, goal: FloatArray
     ) -> None:
         self.priors_, self.means_, self.covariances_ = priors, means, covariances
-        self.field_ = MixtureField(priors, means, covariances)
+        self.field_ = MixtureField.of_joint(priors, means, covariances)
         self._goal = goal
 
     def _velocity(self, x: FloatArray) -> FloatArray:
         return self.field_.velocity(x - self._goal)
 
     def _log_prob(self, x: FloatArray, x_next: FloatArray, dt: float) -> FloatArray:
-        v = (x_next - x) / dt
-        return np.asarray(self.field_.log_prob(x - self._goal, v) - x.shape[1] * np.log(dt))
+        return self.field_.transition_log_prob(x - self._goal, x_next - self._goal, dt)
 
     @property
     def guarantee(self) -> Guarantee:
@@ -335,16 +400,5 @@ class GMR(DynamicalSystem):
         return {"priors": self.priors_, "means": self.means_, "covariances": self.covariances_}
 
     def _restore(self, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        names = ("priors", "means", "covariances")
-        priors, means, covariances = (np.asarray(arrays[k], dtype=np.float64) for k in names)
-        n, size = priors.size, 2 * self.n_dims_
-        expected = [(n,), (n, size), (n, size, size)]
-        came = [a.shape for a in (priors, means, covariances)]
-        if n < 1 or came != expected:
-            raise ValueError(
-                f"expected {', '.join(names)} of shapes {expected} with n >= 1, got {came}"
-            )
-        if not ((priors > 0).all() and abs(priors.sum() - 1) <= PRIORS_TOLERANCE):
-            raise ValueError(f"expected priors > 0 that sum to 1, got {priors}")
-        check_positive_definite(covariances, "covariance")
+        priors, means, covariances = checked_mixture(arrays, self.n_dims_)
         self._adopt(priors, means, covariances, self.goal_)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 METHODS = {
     "imitation-flow": "iflow_gym.baselines.imitation_flow:ImitationFlow",
+    "seds": "iflow_gym.baselines.seds:SEDS",
+    "clf-dm": "iflow_gym.baselines.clf_dm:CLFDM",
     "linear": "iflow_gym.baselines.linear:StableLinear",
     "gmr": "iflow_gym.baselines.gmr:GMR",
     "gpr": "iflow_gym.baselines.gpr:GPR",

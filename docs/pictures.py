@@ -1,12 +1,14 @@
 """Makes the pictures of the documentation: `python docs/pictures.py`, two minutes.
 
 docs/images/bend.png         the README's: one latent system, bent into three motions
+docs/images/conditional.png  one model of four shapes, and a context between two of them
 docs/images/environment.png  a frame of an environment, with a policy's stream lines
 docs/images/<method>.png     what a method does, for every page of docs/methods that shows it;
                              `python docs/pictures.py <method> ...` draws these alone
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium as gym
@@ -15,14 +17,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import iflow_gym  # registers the environments
-from iflow_gym.baselines.imitation_flow import ImitationFlow
+from iflow_gym.baselines.imitation_flow import ConditionalImitationFlow, ImitationFlow
 from iflow_gym.baselines.registry import METHODS, load_method
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.envs.task import Push
 from iflow_gym.figures import reproductions, save_figure
-from iflow_gym.plotting import plot_field, plot_rollouts, plot_streamlines
+from iflow_gym.plotting import plot_field, plot_rollouts, plot_streamlines, view
 from iflow_gym.policy import policy_of
 from iflow_gym.registration import lasa_id
+from iflow_gym.system import DynamicalSystem
 
 IMAGES = Path(__file__).parent / "images"
 SHAPES = ("Sshape", "GShape", "Sharpc")
@@ -48,6 +51,28 @@ def bend() -> None:
         ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
         ax.set_aspect("equal")
     figure.savefig(IMAGES / "bend.png", bbox_inches="tight")
+
+
+def conditional() -> None:
+    """Draw one flow in five contexts: four that it learned, and one between two of them."""
+    shapes = ("Angle", "Sshape", "Leaf_1", "CShape")
+    motions = [load_lasa(shape) for shape in shapes]
+    model = ConditionalImitationFlow().fit(motions, seed=0)
+    figure = Figure(figsize=(14, 3.2), layout="constrained", dpi=100)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(shapes) + 1)
+    for ax, motion, context in zip(axes, motions, np.eye(len(shapes)), strict=False):
+        system = model.at(context)
+        plot_field(ax, system, motion, reproductions(system, motion))
+        ax.set_title(f"context {context.astype(int).tolist()}", fontsize=9)
+    between = model.at([0, 0, 0.5, 0.5])
+    starts = np.concatenate([m.starts[:3] for m in motions[2:]])
+    paths = list(between.rollout(starts, 2000, motions[2].mean_dt))
+    plot_field(axes[-1], between, motions[2], paths)
+    axes[-1].set_title("context [0, 0, 0.5, 0.5]", fontsize=9)
+    for ax in axes:
+        ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    figure.savefig(IMAGES / "conditional.png", bbox_inches="tight")
 
 
 def environment() -> None:
@@ -112,9 +137,35 @@ def method_sheet(name: str) -> Figure:
 def method_sheets(names: list[str]) -> None:
     """Draw the methods whose page shows their picture, or the named ones."""
     for name in names or METHODS:
-        page = IMAGES.parent / "methods" / f"{name}.md"
-        if names or (page.is_file() and f"images/{name}.png" in page.read_text()):
+        page, method = IMAGES.parent / "methods" / f"{name}.md", load_method(name)
+        if not (names or (page.is_file() and f"images/{name}.png" in page.read_text())):
+            continue
+        if (
+            issubclass(method, DynamicalSystem)
+            and method._lyapunov is not DynamicalSystem._lyapunov
+        ):
+            level_sets(method, ("Worm", "Angle", "Sharpc"), f"{name}.png")
+        else:
             save_figure(method_sheet(name), IMAGES / f"{name}.png", dpi=100)
+
+
+def level_sets(method: type[DynamicalSystem], shapes: Sequence[str], name: str) -> None:
+    """Draw level sets of V over the stream lines, with the reproductions of the recordings."""
+    figure = Figure(figsize=(4.4 * len(shapes), 4.5), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    for ax, shape in zip(figure.subplots(1, len(shapes)), shapes, strict=True):
+        motion = load_lasa(shape)
+        system = method().fit(motion, seed=0)
+        plot_field(ax, system, motion, reproductions(system, motion))
+        low, high = view(motion)
+        axes = [np.linspace(a, b, 200) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes), axis=-1)
+        # Levels that share the picture out evenly: V is flat along a motion and steep beside it.
+        height = np.asarray(system.lyapunov(grid))
+        levels = np.quantile(height, np.linspace(0, 1, 26)[1:-1])
+        ax.contour(*axes, height, levels, colors="#4d4d4d", linewidths=0.7, alpha=0.75, zorder=2)
+        ax.set_title(motion.name)
+    figure.savefig(IMAGES / name, bbox_inches="tight")
 
 
 if __name__ == "__main__":
@@ -122,4 +173,5 @@ if __name__ == "__main__":
     if len(sys.argv) == 1:
         environment()
         bend()
+        conditional()
     method_sheets(sys.argv[1:])

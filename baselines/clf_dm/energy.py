@@ -1,0 +1,278 @@
+"""V, a weighted sum of asymmetric quadratic functions (WSAQF), and how it is learned.
+
+Khansari-Zadeh & Billard, "Learning control Lyapunov function to ensure stability of dynamical
+system-based robot reaching motions", Robotics and Autonomous Systems 62(6), 2014:
+
+    V(x) = xᵀ P_0 x + sum_l beta_l (xᵀ P_l (x - mu_l))²,   beta_l = 1 where the bracket is >= 0
+
+(eq. (3)), x the offset from the goal, every P positive definite. V is continuously differentiable,
+and along every ray from the goal it grows without end, so that the goal is its only minimum. P need
+not be more than symmetric: an asymmetric one is a symmetric one with another mu.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from iflow_gym.demonstrations import FloatArray
+
+LEAST_SHARE = 0.02
+"""a in P = T Tᵀ + a tr(T Tᵀ) I: no eigenvalue in the plane is below about a fiftieth of the sum (in
+the authors' demonstration, a tenth). Without it level sets are slits, along which a state may go
+far away before V lets it return."""
+
+CANDIDATES = 8
+"""Places where a new asymmetric term is tried."""
+
+TRIAL_ITERATIONS, ITERATIONS = 60, 300
+"""Of the solver, for each candidate and from the best."""
+
+LEAST_SPEED = 0.05
+"""Of the fastest sample: a hand that hesitates has no direction to learn from."""
+
+LEAST_LEFT = 1e-3
+"""Of w: nearer than this to -w, there is nothing left to gain but rounding."""
+
+NEWTON_STEPS = 60
+"""At most; two or three are usual."""
+
+
+class Energy:
+    """V, ready for many calls.
+
+    Parameters
+    ----------
+    matrices : array, shape (L + 1, d, d)
+        P_0 .. P_L, symmetric and positive definite.
+    centres : array, shape (L, d)
+        mu_1 .. mu_L.
+    """
+
+    def __init__(self, matrices: FloatArray, centres: FloatArray) -> None:
+        self.matrices, self.centres = matrices, centres
+        n, d = matrices.shape[:2]
+        self._shape = (-1, n, d)
+        self._stacked = matrices.reshape(-1, d).T.copy()
+        self._shifts = np.zeros((n, d))  # P_l mu_l
+        self._shifts[1:] = np.einsum("lij,lj->li", matrices[1:], centres)
+
+    def _brackets(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return P_l x, shape (n, L + 1, d), and the brackets where they count, (n, L + 1)."""
+        products = (x @ self._stacked).reshape(self._shape)
+        brackets = ((products - self._shifts) @ x[:, :, None])[:, :, 0]
+        np.maximum(brackets, 0.0, out=brackets)
+        return products, brackets
+
+    def value(self, x: FloatArray) -> FloatArray:
+        """Return V, shape (n,), of offsets x, shape (n, d)."""
+        _, brackets = self._brackets(x)
+        return np.asarray(brackets[:, 0] + (brackets[:, 1:] ** 2).sum(axis=1))
+
+    def value_and_gradient(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return V, shape (n,), and its gradient, shape (n, d)."""
+        products, brackets = self._brackets(x)
+        value = brackets[:, 0] + (brackets[:, 1:] ** 2).sum(axis=1)
+        weights = 2.0 * brackets
+        weights[:, 0] = 1.0
+        gradient = (weights[:, None] @ (2.0 * products - self._shifts))[:, 0]
+        return value, gradient
+
+    def pulled_back(self, x: FloatArray, level: FloatArray) -> FloatArray:
+        """Return the points s x, 0 < s <= 1, with V(s x) = level, for V(x) >= level > 0.
+
+        V(s x) is convex and increasing in s, so that Newton's method from s = 1 falls to the root.
+        """
+        squares = ((x @ self._stacked).reshape(self._shape) @ x[:, :, None])[:, :, 0]
+        slopes = x @ self._shifts.T
+        s = np.ones(len(x))
+        for _ in range(NEWTON_STEPS):
+            brackets = s[:, None] * (s[:, None] * squares - slopes)
+            rates = 2.0 * s[:, None] * squares - slopes
+            np.maximum(brackets, 0.0, out=brackets)
+            weights = 2.0 * brackets
+            weights[:, 0] = 1.0
+            excess = brackets[:, 0] + (brackets[:, 1:] ** 2).sum(axis=1) - level
+            change = np.maximum(excess, 0.0) / (weights * rates).sum(axis=1)
+            s -= change
+            if (change <= 1e-12 * s).all():
+                break
+        return np.asarray(s[:, None] * x)
+
+
+@dataclass(frozen=True)
+class EnergyForm:
+    """Between V and a vector: mu_l, and lower triangular T_l, P_l = T_l T_lᵀ + a tr(T_l T_lᵀ) I."""
+
+    n_terms: int
+    n_dims: int
+
+    @cached_property
+    def _lower(self) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        rows, columns = np.tril_indices(self.n_dims)
+        return rows, columns
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        d = self.n_dims
+        return self.n_terms * d + (self.n_terms + 1) * d * (d + 1) // 2
+
+    def roots_and_centres(self, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return T, shape (L + 1, d, d), and mu, shape (L, d)."""
+        n, d = self.n_terms, self.n_dims
+        roots = np.zeros((n + 1, d, d))
+        rows, columns = self._lower
+        roots[:, rows, columns] = vector[n * d :].reshape(n + 1, -1)
+        return roots, vector[: n * d].reshape(n, d)
+
+    def energy(self, vector: FloatArray) -> Energy:
+        """Return V."""
+        roots, centres = self.roots_and_centres(vector)
+        traces = (roots**2).sum(axis=(1, 2))[:, None, None]
+        least = LEAST_SHARE * traces * np.eye(self.n_dims)
+        return Energy(roots @ np.swapaxes(roots, 1, 2) + least, centres)
+
+    def flattened(self, roots: FloatArray, centres: FloatArray) -> FloatArray:
+        """Return the vector of T and mu, or of a gradient with respect to them."""
+        rows, columns = self._lower
+        return np.concatenate([centres.ravel(), roots[:, rows, columns].ravel()])
+
+
+def objective(
+    vector: FloatArray, form: EnergyForm, x: FloatArray, directions: FloatArray, weight: float
+) -> tuple[float, FloatArray]:
+    """Return the mean of (1 + w)/2 sign(psi) psi² + (1 - w)/2 psi² and its gradient (eq. (7)).
+
+    Parameters
+    ----------
+    vector : array, shape (size,)
+    form : EnergyForm
+    x : array, shape (n, d)
+        Offsets from the goal.
+    directions : array, shape (n, d)
+        Unit vectors along the velocities; psi is the cosine of the angle to the gradient of V.
+    weight : float
+        w: psi² counts where psi > 0, -w psi² where V descends.
+    """
+    roots, centres = form.roots_and_centres(vector)
+    energy = form.energy(vector)
+    products, brackets = energy._brackets(x)
+    inner = 2.0 * products - energy._shifts
+    weights = 2.0 * brackets
+    weights[:, 0] = 1.0
+    gradient = (weights[:, None] @ inner)[:, 0]
+    norms = np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    unit = gradient / norms
+    psi = (unit * directions).sum(axis=1, keepdims=True)
+    signed = np.where(psi > 0, 1.0, -weight)
+    value = float(np.mean(signed * psi**2))
+    # d psi = (v - psi g) · dg / |g|, g the unit gradient.
+    pull = 2.0 * signed * psi * (directions - psi * unit) / (norms * len(x))
+    # g = sum_l w_l (2 P_l x - P_l mu_l), w_l = 2 max(q_l, 0), q_l = xᵀ P_l (x - mu_l).
+    along = 2.0 * (inner @ pull[:, :, None])[:, :, 0] * (brackets > 0)
+    along[:, 0] = 0.0
+    of_products = 2.0 * weights[:, :, None] * pull[:, None] + along[:, :, None] * x[:, None]
+    of_matrices = (of_products.reshape(len(x), -1).T @ x).reshape(roots.shape)
+    of_shifts = -(weights.T @ pull) - along.T @ x
+    of_centres = np.einsum("lij,lj->li", energy.matrices[1:], of_shifts[1:])
+    of_matrices[1:] += of_shifts[1:, :, None] * centres[:, None]
+    of_roots = (of_matrices + np.swapaxes(of_matrices, 1, 2)) @ roots
+    of_roots += 2.0 * LEAST_SHARE * np.einsum("lii->l", of_matrices)[:, None, None] * roots
+    return value, form.flattened(of_roots, of_centres)
+
+
+def _start(
+    wider: EnergyForm,
+    roots: FloatArray,
+    centres: FloatArray,
+    x: FloatArray,
+    rng: np.random.Generator,
+    fresh: bool,
+) -> FloatArray:
+    """Return a start with one term more: what was found and a new term, or all terms anew.
+
+    New terms have their mu near samples, and random shapes and sizes.
+    """
+    n_new = wider.n_terms if fresh else 1
+    d = wider.n_dims
+    where = x[rng.integers(len(x), size=n_new)] * rng.uniform(0.2, 2.0, size=(n_new, 1))
+    sizes = np.exp(rng.uniform(np.log(0.1), np.log(3.0), size=(n_new, 1, 1)))
+    shapes = sizes * (np.eye(d) + 0.5 * np.tril(rng.normal(size=(n_new, d, d))))
+    if fresh:
+        roots, centres = roots[:1], centres[:0]
+    return wider.flattened(np.concatenate([roots, shapes]), np.concatenate([centres, where]))
+
+
+def learn_energy(
+    x: FloatArray,
+    v: FloatArray,
+    max_terms: int,
+    least_gain: float,
+    weight: float,
+    rng: np.random.Generator,
+) -> list[Energy]:
+    """Learn V: one asymmetric term after another, as long as the objective gains.
+
+    Parameters
+    ----------
+    x, v : arrays, shape (n, d)
+        Offsets from the goal, of root mean square 1, and velocities of any unit. Samples that
+        lie at the goal, or are slower than `LEAST_SPEED`, are left out.
+    max_terms : int
+        Most asymmetric terms.
+    least_gain : float
+        A further term has to lower the objective by this fraction of its distance from the
+        least that it could be, -w.
+    weight : float
+        w of `objective`.
+    rng : numpy Generator
+        Draws where new terms are tried.
+
+    Returns
+    -------
+    list of Energy
+        V with 0, 1, .. terms, up to the last that gained; each scaled so that its mean over x is 1.
+    """
+    d = x.shape[1]
+    speeds, distances = np.linalg.norm(v, axis=1), np.linalg.norm(x, axis=1)
+    moving = (speeds > LEAST_SPEED * speeds.max()) & (distances > 1e-9 * distances.max())
+    x, directions = x[moving], v[moving] / speeds[moving, None]
+
+    def search(vector: FloatArray, form: EnergyForm, iterations: int) -> tuple[float, FloatArray]:
+        result = minimize(
+            objective,
+            vector,
+            args=(form, x, directions, weight),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": iterations, "ftol": 1e-12, "gtol": 1e-9, "maxcor": 20},
+        )
+        return float(result.fun), np.asarray(result.x)
+
+    form = EnergyForm(0, d)
+    best, vector = search(form.flattened(np.eye(d)[None], np.empty((0, d))), form, ITERATIONS)
+    found = [form.energy(vector)]
+    for n_terms in range(1, max_terms + 1):
+        roots, centres = form.roots_and_centres(vector)
+        wider = EnergyForm(n_terms, d)
+        starts = [_start(wider, roots, centres, x, rng, i % 2 == 0) for i in range(CANDIDATES)]
+        tried = [search(start, wider, TRIAL_ITERATIONS) for start in starts]
+        value, reached = search(min(tried, key=lambda t: t[0])[1], wider, ITERATIONS)
+        if best - value < least_gain * max(best + weight, LEAST_LEFT * weight):
+            break
+        best, vector, form = value, reached, wider
+        found.append(form.energy(vector))
+    return [_scaled(energy, x) for energy in found]
+
+
+def _scaled(energy: Energy, x: FloatArray) -> Energy:
+    """Return V over its mean at the samples."""
+    scale = 1.0 / float(energy.value(x).mean())
+    matrices = energy.matrices * np.sqrt(scale)
+    matrices[0] *= np.sqrt(scale)
+    return Energy(matrices, energy.centres)
