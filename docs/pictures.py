@@ -19,7 +19,7 @@ from iflow_gym.baselines.clf_dm import CLFDM
 from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.baselines.seds import SEDS
 from iflow_gym.datasets.lasa import load_lasa
-from iflow_gym.figures import reproductions
+from iflow_gym.figures import reproductions, save_figure
 from iflow_gym.plotting import plot_field, plot_streamlines, view
 from iflow_gym.system import DynamicalSystem
 
@@ -82,7 +82,7 @@ def level_sets(method: type[DynamicalSystem], shapes: Sequence[str], name: str) 
         levels = np.quantile(height, np.linspace(0, 1, 26)[1:-1])
         ax.contour(*axes, height, levels, colors="#4d4d4d", linewidths=0.7, alpha=0.75, zorder=2)
         ax.set_title(motion.name)
-    figure.savefig(IMAGES / name, bbox_inches="tight")
+    save_figure(figure, IMAGES / name, dpi=110)
 
 
 def seds() -> None:
