@@ -1,9 +1,10 @@
 """Figure 3 of the ImitationFlow paper, from records: `python benchmarks/figure3.py`.
 
 ImitationFlow, CLF-DM and SEDS on the four metrics of the paper, over LASA-26, reproduction: box
-plots of the shapes' means over the seeds, medians over the shapes with 95 % bootstrap intervals of
-seeds drawn anew within each shape, and for each pair of neighbours in the paper's order on how many
-shapes the first is ahead. The records are those of `baselines/run_all.py --preset full`.
+plots of the shapes' means over the seeds, medians over the shapes with 95 % bootstrap intervals for
+which shapes are drawn anew, and seeds within each, and for each pair of neighbours in the paper's
+order on how many shapes the first is ahead. The records are those of
+`baselines/run_all.py --preset full`.
 
     python benchmarks/figure3.py --results leaderboard/results --output docs/images/figure3.png
 """
@@ -44,7 +45,9 @@ def median_interval(groups, rng):
         group[rng.integers(len(group), size=(N_RESAMPLES, len(group)))].mean(axis=1)
         for group in groups.values()
     ]
-    return np.nanquantile(np.nanmedian(np.stack(means), axis=0), [0.025, 0.975])
+    drawn = rng.integers(len(means), size=(len(means), N_RESAMPLES))
+    resampled = np.take_along_axis(np.stack(means), drawn, axis=0)
+    return np.nanquantile(np.nanmedian(resampled, axis=0), [0.025, 0.975])
 
 
 def main():
