@@ -53,17 +53,17 @@ class Hand:
     """Curvature, times height, below which the hand becomes no faster."""
     lag: float = 0.25
     """Time constant of the variation, in rounds."""
-    aim: Variation = Variation(0.010, 0.006)
-    """Of each via point, a coordinate."""
+    aim: Variation = Variation(0.011, 0.006)
+    """Of each via point, a coordinate; neighbours on the outline are aimed at alike."""
     size: Variation = Variation(0.014, 0.015)
     """Of the logarithm of the size."""
     slant: Variation = Variation(0.012, 0.015)
     """In radians; a shear, as slant is in handwriting."""
-    place: Variation = Variation(0.012, 0.015)
+    place: Variation = Variation(0.014, 0.015)
     """Of the outline's centre, a coordinate."""
     tempo: Variation = Variation(0.09, 0.10)
     """Of the logarithm of the rate."""
-    pulse: float = 0.12
+    pulse: float = 0.14
     """Root mean square of the rate's fluctuation in the band of tremor, of the rate."""
     tremor: float = 0.0008
     """Root mean square of what tremor adds to a coordinate."""
@@ -167,7 +167,8 @@ def trace(
         return np.asarray(amount.within * process + amount.between * constant[..., None])
 
     shift = varied(place, constants[:2], hand.place)
-    aims = varied(aim, constants[2 : 2 + 2 * n_via], hand.aim)
+    aims = varied(aim, constants[2 : 2 + 2 * n_via], hand.aim).reshape(2, n_via, n)
+    aims = (2 * aims + np.roll(aims, 1, axis=1) + np.roll(aims, -1, axis=1)) / np.sqrt(6)
     size, slant, tempo = (
         varied(process, constant, amount)
         for process, constant, amount in zip(
@@ -179,7 +180,7 @@ def trace(
     phase = start + np.cumsum(rate) - rate[: MARGIN + 1].sum()  # sample MARGIN is at the start
     end = int(np.argmax(phase >= start + n_rounds)) + 1 + MARGIN
     height = outline.height
-    aimed = outline.via.T[:, :, None] + height * aims.reshape(2, n_via, n)
+    aimed = outline.via.T[:, :, None] + height * aims
     path = np.einsum("tj,djt->dt", outline.weights(phase), aimed)
     path[0] += slant * path[1]
     path = np.exp(size) * path + height * (shift + hand.tremor * tremor[:2])

@@ -67,8 +67,8 @@ _VIA = {
 _PERIODS = {"I": 0.8, "R": 2.6, "O": 0.75, "S": 1.0}
 """Usual duration of a round in seconds."""
 
-_DRAWS = {("I", 3): 1, ("R", 10): 1}
-"""Recordings drawn again, so many times: in those before, the end of a round crossed its start."""
+_DRAWS = {("I", 7): 1, ("R", 10): 1}
+"""Recordings drawn again, so many times: in the draws before, a round's end crossed its start."""
 
 HAND = Hand()
 
