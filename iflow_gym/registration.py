@@ -8,6 +8,7 @@ from __future__ import annotations
 import gymnasium
 
 from iflow_gym.datasets.lasa import SHAPES
+from iflow_gym.datasets.letters import LETTERS
 
 POINT_MASS_ID = "iflow/PointMass-v0"
 """The id that takes the caller's own `demonstrations`."""
@@ -18,11 +19,20 @@ def lasa_id(shape: str) -> str:
     return f"iflow/LASA-{shape}-v0"
 
 
+def letter_id(letter: str, *, recorded: bool = False) -> str:
+    """Return the id of a letter, of the suite's own or of the recorded ones."""
+    return f"iflow/Letter{'Recorded' if recorded else ''}-{letter}-v0"
+
+
 def register_all() -> None:
     """Register every id with Gymnasium; ids that are registered already stay as they are."""
     _register(POINT_MASS_ID, "point_mass:PointMassEnv", "point_mass_vector:PointMassVectorEnv")
     for shape in SHAPES:
         _register(lasa_id(shape), "lasa:LASAEnv", "lasa:LASAVectorEnv", shape=shape)
+    for name in ("Letter", "LetterRecorded"):
+        for letter in LETTERS:
+            env_id = letter_id(letter, recorded=name == "LetterRecorded")
+            _register(env_id, f"letters:{name}Env", f"letters:{name}VectorEnv", letter=letter)
 
 
 def _register(env_id: str, entry_point: str, vector_entry_point: str, **kwargs: object) -> None:

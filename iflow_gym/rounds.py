@@ -89,7 +89,7 @@ def round_starts(positions: ArrayLike, dt: float, period: float | None = None) -
     phase = phases(positions, dt, period)
     whole = np.arange(np.floor(phase[-1] + 0.5 / len(phase)) + 1)
     crossings = np.interp(whole, phase, np.arange(len(phase)))
-    return np.rint(crossings).astype(np.int64)
+    return np.asarray(np.rint(crossings), dtype=np.int64)
 
 
 def period_of(positions: ArrayLike, dt: float) -> float:
@@ -237,7 +237,7 @@ def _recurrent_lags(states: FloatArray) -> list[int]:
     lags = np.flatnonzero(
         low & away & (loose <= RECURRENCE) & (np.arange(longest + 1) >= LEAST_SAMPLES)
     )
-    found = []
+    found: list[int] = []
     while len(lags) and len(found) < CANDIDATES:
         near = lags[lags <= lags[0] * (1 + SLACK)]
         found.append(int(near[np.argmin(strict[near])]))

@@ -1,6 +1,7 @@
 """Letters made by a model of a hand: closed outlines, the power law, the same on every platform."""
 
 import importlib.util
+import itertools
 import os
 from pathlib import Path
 
@@ -127,7 +128,7 @@ def test_every_recording_has_four_rounds_that_never_cross_themselves(letter):
         phase = r.phases[MARGIN:-MARGIN] - r.phases[MARGIN]
         assert phase[-2] < N_ROUNDS <= phase[-1]
         cuts = np.append(np.searchsorted(phase, np.arange(N_ROUNDS)), len(phase) - 1)
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        for a, b in itertools.pairwise(cuts):
             assert len(crossings(positions[a:b])) == 0
             assert turning(positions[a : b + 1]) == pytest.approx(1, abs=0.2)
         # Wherever a round is cut: what meets is a round apart, or nearly.
