@@ -17,7 +17,7 @@ itself.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from iflow_gym.demonstrations import FloatArray
@@ -62,7 +62,7 @@ LEAST_SAMPLES = 8
 """In a round."""
 
 
-def round_starts(positions: ArrayLike, dt: float, period: float | None = None) -> np.ndarray:
+def round_starts(positions: ArrayLike, dt: float, period: float | None = None) -> NDArray[np.int64]:
     """Return the samples at which rounds begin, counted from the first sample.
 
     Parameters
@@ -203,9 +203,7 @@ def _recurrence(points: FloatArray) -> float:
         states = _states(path)
         lags = _recurrent_lags(states)
         if lags:
-            residuals = np.array([_align(*_thinned(states, lag))[1] for lag in lags])
-            # The first of those that fit about as well as any.
-            return float(lags[int(np.argmax(residuals <= residuals.min() + AS_GOOD))] * stride)
+            return float(_period_among(states, lags) * stride)
         if len(points) <= SCAN * stride:
             raise ValueError(
                 "Expected a recording that returns to where it was, in position and direction, "
@@ -213,6 +211,17 @@ def _recurrence(points: FloatArray) -> float:
                 "rounds."
             )
         stride *= 2
+
+
+def _period_among(states: FloatArray, lags: list[int]) -> int:
+    """Return the first of some lags whose rounds are about as much alike as any's."""
+    residuals: list[float] = []
+    for lag in lags:
+        residuals.append(_align(*_thinned(states, lag))[1])
+        if residuals[-1] <= AS_GOOD:  # then no other is better by more
+            break
+    good = np.array(residuals) <= min(residuals) + AS_GOOD
+    return lags[int(np.argmax(good))]
 
 
 def _recurrent_lags(states: FloatArray) -> list[int]:
@@ -285,8 +294,8 @@ def _closed_round(states: FloatArray, lag: float) -> FloatArray:
 
 
 def _best_path(
-    states: FloatArray, template: FloatArray, moves: np.ndarray, penalty: FloatArray
-) -> np.ndarray:
+    states: FloatArray, template: FloatArray, moves: NDArray[np.int64], penalty: FloatArray
+) -> NDArray[np.int64]:
     """Return the bins, unwrapped, of the cheapest monotone alignment with the template."""
     n = len(states)
     costs = (
