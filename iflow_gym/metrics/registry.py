@@ -285,7 +285,18 @@ FILES: dict[Motion, tuple[str, ...]] = {
 
 
 def metrics_of(motion: Motion) -> tuple[Metric, ...]:
-    """Return the metrics that are numbers of a motion, in the order of their tables."""
+    """Metrics that are numbers of a motion.
+
+    Parameters
+    ----------
+    motion
+        "goal" or "cycle".
+
+    Returns
+    -------
+    tuple of Metric
+        In the order of their tables.
+    """
     return tuple(metric for metric in METRICS if motion in metric.motions)
 
 
