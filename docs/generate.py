@@ -112,9 +112,9 @@ box enlarged by half of each side at every end, over five times the longest reco
 recordings' starts with a push of 25 % of the box's diagonal at 40 % of the way. Converged means
 within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
 
-**Motions that repeat** are rolled out over eight periods; the last two are the steady orbit, which is
-compared with the recording's own samples. Attraction is seen from the same grid of starts: over the
-last period a rollout stays within 5 % of the diagonal of the recordings.
+**Motions that repeat** are rolled out over eight periods; the last two are the steady orbit, which
+is compared with the recording's own samples. Attraction is seen from the same grid of starts: over
+the last period a rollout stays within 5 % of the diagonal of the recordings.
 
 **Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,
 direction, velocity, likelihood, Lyapunov function) is null for them, not zero. They converge
