@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from iflow_gym.baselines.imitation_flow import rounds
+from iflow_gym.baselines.imitation_flow import frequency
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 
 DRAWN_AT_ONCE = 64
@@ -97,13 +97,11 @@ class Task:
     @property
     def centred(self) -> list[FloatArray]:
         """The recordings relative to their origins."""
-        return [
-            p - o for m, o in zip(self.motions, self.origins, strict=True) for p in m.positions
-        ]
+        return [p - o for m, o in zip(self.motions, self.origins, strict=True) for p in m.positions]
 
     @cached_property
     def principal_axes(self) -> FloatArray:
-        """The principal axes as columns, (d, d), in which the first two make a circle of the motion.
+        """The principal axes as columns, (d, d), in which the motion is about a circle.
 
         Their lengths are sqrt(2) times the spread: the radius of a circle along its axes.
         """
@@ -117,7 +115,7 @@ class Task:
         """Seconds of a round of each recording: its own, or the given where it has too few."""
         inverse = np.linalg.inv(self.principal_axes).T
         steps = [(h, m.period) for m in self.motions for h in m.dt]
-        found = [rounds.period(path @ inverse) for path in self.centred]
+        found = [frequency.period(path @ inverse) for path in self.centred]
         return [
             h * samples if samples is not None else float(given or 0.0)
             for samples, (h, given) in zip(found, steps, strict=True)
@@ -138,14 +136,14 @@ class Task:
         return [p @ inverse for p in self.centred]
 
     def steps(self, frame: Frame) -> list[float]:
-        """Return the sample time of each recording in a frame: each has its own tempo in a cycle."""
+        """Return the sample time of each recording in a frame; a cycle's have their own tempos."""
         steps = [h for m in self.motions for h in m.dt]
         return [h / t for h, t in zip(steps, self._times(frame), strict=True)]
 
     def peak_speed(self, frame: Frame) -> float:
         """Return the recordings' greatest speed, in length per unit of time."""
-        speeds = [float(np.linalg.norm(v, axis=1).max()) for m in self.motions for v in m.velocities]
-        return max(v * t for v, t in zip(speeds, self._times(frame), strict=True))
+        speeds = [np.linalg.norm(v, axis=1).max() for m in self.motions for v in m.velocities]
+        return float(max(v * t for v, t in zip(speeds, self._times(frame), strict=True)))
 
     def _times(self, frame: Frame) -> Sequence[float]:
         """Seconds of a unit of time for each recording."""
