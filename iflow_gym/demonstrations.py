@@ -61,6 +61,8 @@ class Demonstrations:
         Where a point-to-point motion ends; None for a cycle.
     period : float or None
         Duration of a round in seconds; None for a point-to-point motion.
+    held_out : int
+        So many of the last recordings are never fitted on, by any protocol.
     """
 
     positions: tuple[FloatArray, ...]
@@ -71,6 +73,7 @@ class Demonstrations:
     name: str = "unnamed"
     length_unit: str = "m"
     source: str = "arrays"
+    held_out: int = 0
 
     @classmethod
     def from_arrays(
@@ -87,6 +90,7 @@ class Demonstrations:
         name: str = "unnamed",
         length_unit: str = "m",
         source: str = "arrays",
+        held_out: int = 0,
     ) -> Demonstrations:
         """Check recordings and make a set of demonstrations of them.
 
@@ -111,6 +115,8 @@ class Demonstrations:
         resample : bool
             Interpolate recordings with uneven `times` linearly on an even grid of as many
             samples.
+        held_out : int
+            So many of the last recordings are kept to test on, see `split`; fewer than there are.
 
         Raises
         ------
@@ -151,6 +157,11 @@ class Demonstrations:
             )
         elif not (np.isfinite(period) and period > 0):
             raise ValueError(f"Expected a positive period in seconds, got {period}.")
+        if type(held_out) is not int or not 0 <= held_out < len(points):
+            raise ValueError(
+                f"Expected held_out to be a whole number from 0 to {len(points) - 1}, one less "
+                f"than there are recordings, got {held_out!r}."
+            )
         return cls(
             positions=tuple(_frozen(p) for p in points),
             velocities=tuple(_frozen(v) for v in speeds),
@@ -160,6 +171,7 @@ class Demonstrations:
             name=name,
             length_unit=length_unit,
             source=source,
+            held_out=held_out,
         )
 
     def __len__(self) -> int:
@@ -231,10 +243,12 @@ class Demonstrations:
             digest.update(np.ascontiguousarray(v, dtype="<f8").tobytes())
         end = [self.period] if self.goal is None else self.goal
         digest.update(np.asarray(end, dtype="<f8").tobytes())
+        if self.held_out:
+            digest.update(np.asarray(self.held_out, dtype="<i8").tobytes())
         return digest.hexdigest()
 
     def subset(self, indices: Iterable[int]) -> Demonstrations:
-        """Return the recordings at `indices`, with the same goal or period."""
+        """Return the recordings at `indices`, with the same goal or period; none is held out."""
         chosen = [range(len(self))[i] for i in indices]
         if not chosen:
             raise ValueError("Expected at least one index of a recording, got none.")
@@ -253,12 +267,17 @@ class Demonstrations:
         """Return what to fit on and what to score on.
 
         ``"reproduction"`` fits and scores on every recording; ``"generalisation"`` fits on the
-        first four sevenths (rounded; 1-4 of LASA's 7) and scores on the rest.
+        first four sevenths (rounded; 1-4 of LASA's 7) and scores on the rest. A set with recordings
+        held out is fitted on the others by both, and ``"generalisation"`` scores on those held out.
         """
-        if protocol == "reproduction":
-            return Split(self, self)
-        if protocol != "generalisation":
+        if protocol not in PROTOCOLS:
             raise ValueError(f"Expected a protocol of {PROTOCOLS}, got {protocol!r}.")
+        n_shown = len(self) - self.held_out
+        shown = self.subset(range(n_shown)) if self.held_out else self
+        if protocol == "reproduction":
+            return Split(shown, shown)
+        if self.held_out:
+            return Split(shown, self.subset(range(n_shown, len(self))))
         if len(self) < 2:
             raise ValueError(
                 f"Expected at least 2 recordings for the generalisation protocol, got {len(self)}: "

@@ -89,6 +89,7 @@ class TestFromArrays:
             ([line(), np.zeros((20, 3))], {"dt": 0.1}, r"one dimension, got dimensions \[2, 3\]"),
             ([line()], {"dt": 0.0}, "dt > 0 in seconds, got 0.0"),
             ([line()], {"dt": [0.1, 0.1]}, "one for each of 1 recordings, got 2"),
+            ([line()] * 2, {"dt": 0.1, "held_out": 2}, "held_out .* from 0 to 1, .* got 2"),
             ([line()], {}, "either dt .* or times .*, got neither"),
             ([line()], {"dt": 0.1, "times": [np.arange(20)]}, "got both"),
             ([line()], {"times": [np.arange(20)[::-1]]}, "to increase, got 19.0 then 18.0"),
@@ -140,6 +141,16 @@ class TestSplits:
         assert fit.dt == motion.dt[:n_fit]
         assert score.dt == motion.dt[n_fit:]
         np.testing.assert_array_equal(score.goal, motion.goal)
+
+    def test_what_is_held_out_is_never_fitted_on(self):
+        steps = [0.1 + i for i in range(5)]
+        motion = Demonstrations.from_arrays([line()] * 5, dt=steps, held_out=2)
+        for protocol, scored in (("reproduction", steps[:3]), ("generalisation", steps[3:])):
+            fit, score = motion.split(protocol)
+            assert list(fit.dt) == steps[:3]
+            assert list(score.dt) == scored
+            assert fit.held_out == score.held_out == 0
+        assert motion.sha256 != motion.subset(range(5)).sha256
 
     def test_errors(self):
         motion = Demonstrations.from_arrays([line()], dt=0.1)
