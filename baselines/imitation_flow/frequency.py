@@ -13,6 +13,7 @@ spectrum is as wide as one over the recording, and may be a harmonic of the roun
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -61,17 +62,22 @@ def winding_number(path: FloatArray) -> float:
     return float(turned[-1] - turned[0]) / (2 * math.pi)
 
 
-def period(path: FloatArray) -> float | None:
-    """Return the period of a recording (T, d) in samples; None where it is too short to tell.
+def periods(paths: Sequence[FloatArray]) -> list[float | None]:
+    """Return the period of each recording (T, d) of a motion in samples; None for one too short.
 
-    The origin is the centre, and the first axis the one of largest spread.
+    The origin is the centre, and the first axis the one of largest spread. Which harmonic of the
+    rounds is the main one is a matter of the motion's shape: the recordings' median tells.
     """
-    n = len(path)
-    if n < SHORTEST:
-        return None
-    middle = _harmonic(path) / main_frequency(path[:, 0])
+    long = [path for path in paths if len(path) >= SHORTEST]
+    harmonic = float(np.median([_harmonic(path) for path in long])) if long else 1.0
+    return [_period(path, harmonic) if len(path) >= SHORTEST else None for path in paths]
+
+
+def _period(path: FloatArray, harmonic: float) -> float | None:
+    """Return where the recording is nearest to itself, close to the main frequency's period."""
+    middle = harmonic / main_frequency(path[:, 0])
     low, high = math.floor((1 - NEAR) * middle), math.ceil((1 + NEAR) * middle)
-    shifts = range(max(low, 2), min(high, math.floor((n - 1) / LEAST_ROUNDS)) + 1)
+    shifts = range(max(low, 2), min(high, math.floor((len(path) - 1) / LEAST_ROUNDS)) + 1)
     apart = np.array([_apart(path, k) for k in shifts])
     at = int(apart.argmin()) if len(apart) else 0
     if not 0 < at < len(apart) - 1:
