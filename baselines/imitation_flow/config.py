@@ -11,7 +11,7 @@ Emission = Literal["coupling", "autoregressive", "spline"]
 MOST_LOG_SCALE = 2.0
 """With 2 the inverse has been seen to be off by more than the motion's size in single precision."""
 
-STEPS, CYCLE_STEPS = 5000, 2000
+STEPS, CYCLE_STEPS = 5000, 1500
 """Steps of Adam by default, where motions end and where they repeat."""
 
 Noise = Literal["additive", "vanishing"]
@@ -42,7 +42,7 @@ class ImitationFlowConfig:
     """Slope of the conditioners' units at the start, in the inverse of half the motion's size:
     larger bends sharper corners and generalises less."""
     n_steps: int | None = None
-    """Steps of Adam. None takes 5000 where motions end and 2000 where they repeat, which is one
+    """Steps of Adam. None takes 5000 where motions end and 1500 where they repeat, which is one
     stage instead of two."""
     likelihood_fraction: float = 0.2
     """Share of the steps that maximise the likelihood before the reproduction error is minimised
