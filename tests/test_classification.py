@@ -1,4 +1,4 @@
-"""Classification by trajectories' densities: exact densities, poses, and the change of variables."""
+"""Classification by densities of trajectories: exact ones, poses, and the change of variables."""
 
 import numpy as np
 import pytest
