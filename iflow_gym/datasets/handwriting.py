@@ -7,7 +7,9 @@
 - From round to round the hand is never the same. The aim at every via point, the size, the slant,
   the place and the tempo each follow an Ornstein-Uhlenbeck process that has passed through two
   more lags: muscles smooth what the nerves command, and so the path stays smooth.
-- Physiological tremor, a band of noise around 10 Hz, lies on top.
+- The hand moves in pulses of 8 to 12 Hz (Vallbo & Wessberg, "Organization of motor output in slow
+  finger movements in man", Journal of Physiology 469, 1993), which the speed shows, and trembles in
+  the same band, which the path hardly does.
 
 Random numbers are made of the raw integers of PCG64, which numpy keeps the same for ever; numpy
 keeps no such promise for its normal numbers.
@@ -47,22 +49,24 @@ class Hand:
     """Standard deviation of the Gaussian, along the outline, that rounds its corners."""
     slow_curvature: float = 40.0
     """Curvature, times height, above which the hand slows down no further."""
-    fast_curvature: float = 1.5
+    fast_curvature: float = 0.7
     """Curvature, times height, below which the hand becomes no faster."""
     lag: float = 0.25
     """Time constant of the variation, in rounds."""
-    aim: Variation = Variation(0.012, 0.006)
-    """Of each via point, a coordinate."""
-    size: Variation = Variation(0.012, 0.012)
+    aim: Variation = Variation(0.011, 0.006)
+    """Of each via point, a coordinate; neighbours on the outline are aimed at alike."""
+    size: Variation = Variation(0.014, 0.015)
     """Of the logarithm of the size."""
-    slant: Variation = Variation(0.015, 0.015)
+    slant: Variation = Variation(0.012, 0.015)
     """In radians; a shear, as slant is in handwriting."""
-    place: Variation = Variation(0.012, 0.012)
+    place: Variation = Variation(0.014, 0.015)
     """Of the outline's centre, a coordinate."""
-    tempo: Variation = Variation(0.08, 0.08)
+    tempo: Variation = Variation(0.09, 0.10)
     """Of the logarithm of the rate."""
+    pulse: float = 0.14
+    """Root mean square of the rate's fluctuation in the band of tremor, of the rate."""
     tremor: float = 0.0008
-    """Root mean square, a coordinate."""
+    """Root mean square of what tremor adds to a coordinate."""
     tremor_frequency: float = 10.0
     """Centre of the band in Hz."""
     tremor_bandwidth: float = 4.0
@@ -154,7 +158,7 @@ def trace(
     )
     constants = _uniform(bits, (2 * n_via + 6,))
     tremor = _band(
-        _uniform(bits, (2, n + round(4 / (hand.tremor_bandwidth * dt)))),
+        _uniform(bits, (3, n + round(4 / (hand.tremor_bandwidth * dt)))),
         hand.tremor_frequency * dt,
         hand.tremor_bandwidth * dt,
     )[:, -n:]
@@ -163,7 +167,8 @@ def trace(
         return np.asarray(amount.within * process + amount.between * constant[..., None])
 
     shift = varied(place, constants[:2], hand.place)
-    aims = varied(aim, constants[2 : 2 + 2 * n_via], hand.aim)
+    aims = varied(aim, constants[2 : 2 + 2 * n_via], hand.aim).reshape(2, n_via, n)
+    aims = (2 * aims + np.roll(aims, 1, axis=1) + np.roll(aims, -1, axis=1)) / np.sqrt(6)
     size, slant, tempo = (
         varied(process, constant, amount)
         for process, constant, amount in zip(
@@ -171,14 +176,14 @@ def trace(
         )
     )
     start = constants[-1] / np.sqrt(12) + 0.5
-    rate = np.exp(tempo) * dt / period
+    rate = np.exp(tempo + hand.pulse * tremor[2]) * dt / period
     phase = start + np.cumsum(rate) - rate[: MARGIN + 1].sum()  # sample MARGIN is at the start
     end = int(np.argmax(phase >= start + n_rounds)) + 1 + MARGIN
     height = outline.height
-    aimed = outline.via.T[:, :, None] + height * aims.reshape(2, n_via, n)
+    aimed = outline.via.T[:, :, None] + height * aims
     path = np.einsum("tj,djt->dt", outline.weights(phase), aimed)
     path[0] += slant * path[1]
-    path = np.exp(size) * path + height * (shift + hand.tremor * tremor)
+    path = np.exp(size) * path + height * (shift + hand.tremor * tremor[:2])
     return Recording(path.T[:end], phase[:end])
 
 
