@@ -14,7 +14,8 @@ import numpy as np
 import torch
 import tyro
 
-from iflow_gym.baselines.imitation_flow import ImitationFlow, ImitationFlowConfig, kernels
+from iflow_gym.baselines.imitation_flow import ImitationFlow, kernels
+from iflow_gym.baselines.imitation_flow.config import STEPS
 from iflow_gym.datasets.lasa import SINGLE_MOTIONS, load_lasa
 from iflow_gym.metrics import box_diagonal, dtw, frechet, rmse, start_grid
 
@@ -27,7 +28,7 @@ class Options:
     """Or "generalisation"."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the fits, one run of all shapes each."""
-    n_steps: tuple[int, ...] = (ImitationFlowConfig.n_steps,)
+    n_steps: tuple[int, ...] = (STEPS,)
     """Steps of training; several give the curve of accuracy against seconds."""
     calm: bool = True
     """False leaves the calm penalty out, for comparison."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from iflow_gym.baselines.imitation_flow import frequency
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 
 DRAWN_AT_ONCE = 64
@@ -27,7 +29,7 @@ class Frame:
     Where motions end the origin is the goal, lengths are divided by the largest distance from it
     along an axis, and times by the mean duration. Where they repeat the origin is the mean state,
     the axes are the principal ones, scaled so that the first two become a circle of radius about 1
-    (paper, sec. IV-B), and times are divided by the period.
+    (paper, sec. IV-B), and times are divided by the mean period of the recordings.
     """
 
     matrix: FloatArray
@@ -36,18 +38,12 @@ class Frame:
     @classmethod
     def of(cls, task: Task) -> Frame:
         """Return the frame of a task's recordings."""
-        states = np.concatenate(
-            [p - o for m, o in zip(task.motions, task.origins, strict=True) for p in m.positions]
-        )
-        if not task.cyclic:
-            durations = np.concatenate([m.durations for m in task.motions])
-            length = float(np.abs(states).max())
-            return cls(length * np.eye(task.n_dims), float(durations.mean()))
-        variances, axes = np.linalg.eigh(states.T @ states / len(states))  # ascending
-        spreads = np.sqrt(np.maximum(variances[::-1], 0.0))
-        spreads = np.sqrt(2) * np.maximum(spreads, THINNEST * spreads[0])
-        periods = [m.period for m in task.motions if m.period is not None]
-        return cls(axes[:, ::-1] * spreads, float(np.mean(periods)))
+        if task.cyclic:
+            return cls(task.principal_axes, float(np.mean(task.periods)))
+        states = np.concatenate(task.centred)
+        durations = np.concatenate([m.durations for m in task.motions])
+        length = float(np.abs(states).max())
+        return cls(length * np.eye(task.n_dims), float(durations.mean()))
 
 
 @dataclass(frozen=True)
@@ -99,6 +95,33 @@ class Task:
         return self.n_recordings, self.n_dims, self.n_context, self.cyclic
 
     @property
+    def centred(self) -> list[FloatArray]:
+        """The recordings relative to their origins."""
+        return [p - o for m, o in zip(self.motions, self.origins, strict=True) for p in m.positions]
+
+    @cached_property
+    def principal_axes(self) -> FloatArray:
+        """The principal axes as columns, (d, d), in which the motion is about a circle.
+
+        Their lengths are sqrt(2) times the spread: the radius of a circle along its axes.
+        """
+        states = np.concatenate(self.centred)
+        variances, axes = np.linalg.eigh(states.T @ states / len(states))  # ascending
+        spreads = np.sqrt(np.maximum(variances[::-1], 0.0))
+        return axes[:, ::-1] * (np.sqrt(2) * np.maximum(spreads, THINNEST * spreads[0]))
+
+    @cached_property
+    def periods(self) -> list[float]:
+        """Seconds of a round of each recording: its own, or the given where it has too few."""
+        inverse = np.linalg.inv(self.principal_axes).T
+        steps = [(h, m.period) for m in self.motions for h in m.dt]
+        found = frequency.periods([path @ inverse for path in self.centred])
+        return [
+            h * samples if samples is not None else float(given or 0.0)
+            for samples, (h, given) in zip(found, steps, strict=True)
+        ]
+
+    @property
     def turns(self) -> float:
         """Sense of a planar cycle in its frame: 1 counter-clockwise, -1 clockwise."""
         area = 0.0
@@ -110,22 +133,24 @@ class Task:
     def scaled(self, frame: Frame) -> list[FloatArray]:
         """Return the recordings in a frame."""
         inverse = np.linalg.inv(frame.matrix).T
-        return [
-            (p - o) @ inverse
-            for m, o in zip(self.motions, self.origins, strict=True)
-            for p in m.positions
-        ]
+        return [p @ inverse for p in self.centred]
 
     def steps(self, frame: Frame) -> list[float]:
-        """Return the sample time of each recording in a frame."""
-        return [h / t for m, t in zip(self.motions, self._times(frame), strict=True) for h in m.dt]
+        """Return the sample time of each recording in a frame; a cycle's have their own tempos."""
+        steps = [h for m in self.motions for h in m.dt]
+        return [h / t for h, t in zip(steps, self._times(frame), strict=True)]
 
     def peak_speed(self, frame: Frame) -> float:
         """Return the recordings' greatest speed, in length per unit of time."""
-        return max(m.peak_speed * t for m, t in zip(self.motions, self._times(frame), strict=True))
+        speeds = [np.linalg.norm(v, axis=1).max() for m in self.motions for v in m.velocities]
+        return float(max(v * t for v, t in zip(speeds, self._times(frame), strict=True)))
 
     def _times(self, frame: Frame) -> Sequence[float]:
-        return [frame.time] * len(self.motions) if self.times is None else self.times
+        """Seconds of a unit of time for each recording."""
+        if self.cyclic:
+            return self.periods
+        times = [frame.time] * len(self.motions) if self.times is None else self.times
+        return [t for m, t in zip(self.motions, times, strict=True) for _ in range(len(m))]
 
 
 class Recordings:

@@ -207,12 +207,14 @@ class ImitationFlow(DynamicalSystem):
         self._require_fit()
         rate = f"{self._latent.min_decay / self._time:.3g} / s"
         if self.period_ is not None:
+            centre = "the cycle's centre" if self.n_dims_ == 2 else "the axis of the cycle"
             return Guarantee(
                 "proved",
                 "The squared distance V(x) of h^-1(x) to the latent cycle decreases along the mean "
-                "dynamics from every state but the image of the cycle's centre, since h is a "
-                f"diffeomorphism and the distance decays at {rate} at least. With the additive "
-                "noise the state stays around the cycle in distribution.",
+                f"dynamics from every state off the cycle but the image of {centre}, where the "
+                "field jumps: h is a diffeomorphism, and the distance decays at "
+                f"{rate} at least. With the additive noise the state stays around the cycle in "
+                "distribution.",
             )
         return Guarantee(
             "proved",

@@ -153,15 +153,16 @@ def _train(
     flow = make_flow(config, data.n_dims, tasks[0].n_context, generators).to(device)
     latent = _make_latent(config, tasks).to(device)
     draws = Draws(rngs, _numbers_a_step(config, data), device)
+    n_steps = config.steps(cyclic=data.cyclic)
     adam = GuardedAdam(
         [*((p, 1) for p in flow.parameters()), *((p, 0) for p in latent.parameters())],
         [task.name for task in tasks],
-        n_steps=config.n_steps,
+        n_steps=n_steps,
         learning_rate=config.learning_rate,
         max_norm=config.max_gradient_norm,
     )
     calm = Calm(data, N_CALM, config.calm_speed)
-    for step in range(config.n_steps):
+    for step in range(n_steps):
         if stop.is_set():
             raise TrainingError("Training was stopped.")
         draws.new_step()
@@ -169,8 +170,8 @@ def _train(
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
         adam.step(step, _stage(config, step, data), loss)
-    adam.finish(config.n_steps)
-    if _stage(config, config.n_steps, data) == WHOLE:
+    adam.finish(n_steps)
+    if _stage(config, n_steps, data) == WHOLE:
         _fit_noise(flow, latent, data, rngs)
     flow, latent = flow.to("cpu"), latent.to("cpu")
     return [Trained(flow, latent, m, adam.restarts[m]) for m in range(len(tasks))]
@@ -181,7 +182,7 @@ def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
     if not tasks[0].cyclic:
         return LinearLatent(n, d, min_decay=config.min_decay)
     latent = LimitCycleLatent(n, d, min_decay=config.min_decay)
-    # Times are in periods and the frame makes the first axes a circle (paper, sec. IV-B).
+    # Times are in periods, by the main frequency, and the frame makes the first axes a circle.
     rates = torch.tensor([2 * math.pi * task.turns for task in tasks])
     latent.initialise(rates, max(INITIAL_DECAY, 2 * config.min_decay), 1.0)
     return latent
@@ -224,8 +225,10 @@ def _terms(
 
 def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
     """Whether a step minimises the likelihood or whole reproductions."""
-    ends = config.objective == "reproduction" and not data.cyclic
-    return WHOLE if ends and step >= config.likelihood_fraction * config.n_steps else LIKELIHOOD
+    if config.objective == "paper" or data.cyclic:
+        return LIKELIHOOD
+    n_steps = config.steps(cyclic=False)
+    return WHOLE if step >= config.likelihood_fraction * n_steps else LIKELIHOOD
 
 
 def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:

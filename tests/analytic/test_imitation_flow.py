@@ -322,3 +322,25 @@ class TestCycle:
         assert system.trajectory_log_prob(own, 0.01) == pytest.approx(total)
         with pytest.raises(ValueError, match=r"a trajectory \(T, d\) of more than stride = 300"):
             system.trajectory_log_prob(own, 0.01, stride=300)
+
+    def test_a_transition_has_a_density_in_the_recordings_own_units(self):
+        """It integrates to one over their plane, and its mean is that of `sample` over as long."""
+        motion = circle(radius=200.0, clockwise=True, centre=(50.0, -20.0))
+        system = ImitationFlow(n_steps=60, n_layers=4).fit(motion, seed=0)
+        start, time = motion.starts[0], 0.3
+        drawn = system.sample(np.tile(start, (20_000, 1)), 1, time, rng=np.random.default_rng(0))
+        drawn = drawn[:, 1]
+        centre, half = drawn.mean(axis=0), 6 * drawn.std(axis=0)
+        axis = (np.arange(400) + 0.5) / 200 - 1
+        grid = centre + half * np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        density = np.exp(system.log_prob(np.tile(start, (len(grid), 1)), grid, time))
+        weights = density * np.prod(half / 200)
+        assert weights.sum() == pytest.approx(1.0, abs=2e-3)
+        np.testing.assert_allclose(weights @ grid, centre, atol=0.03 * drawn.std())
+
+    def test_the_centre_is_said_to_be_left_out(self, bean):
+        assert "but the image of the cycle's centre" in bean[1].guarantee.reason
+
+    def test_vanishing_noise_is_refused_with_a_reason(self, bean):
+        with pytest.raises(ValueError, match="rounds cross each other"):
+            ImitationFlow(noise="vanishing").fit(bean[0], seed=0)
