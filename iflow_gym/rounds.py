@@ -87,7 +87,8 @@ def round_starts(positions: ArrayLike, dt: float, period: float | None = None) -
         never returns to where it was.
     """
     phase = phases(positions, dt, period)
-    whole = np.arange(np.floor(phase[-1] + 0.5 / len(phase)) + 1)
+    half_a_sample = 0.5 * phase[-1] / len(phase)
+    whole = np.arange(np.floor(phase[-1] + half_a_sample) + 1)
     crossings = np.interp(whole, phase, np.arange(len(phase)))
     return np.asarray(np.rint(crossings), dtype=np.int64)
 
