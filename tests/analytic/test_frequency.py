@@ -57,8 +57,7 @@ def test_less_than_a_round_and_a_half_says_nothing():
 
 def recordings(periods, given, dt=0.01, n_rounds=3.3):
     paths = [
-        ring(round(n_rounds * p / dt), p / dt, phase, (3.0, 1.0))
-        for phase, p in enumerate(periods)
+        ring(round(n_rounds * p / dt), p / dt, phase, (3.0, 1.0)) for phase, p in enumerate(periods)
     ]
     return Demonstrations.from_arrays(paths, dt=dt, period=given, name="ring")
 
