@@ -151,6 +151,14 @@ class TrajectoryClassifier:
                 counts[i, self.names.index(self.predict(path, dt))] += 1
         return counts
 
+    def accuracy(self, labelled: Mapping[str, Demonstrations]) -> float:
+        """Return the fraction of recordings that were taken for their own class.
+
+        With `varied` it gives the curve over size or tempo.
+        """
+        counts = self.confusion(labelled)
+        return float(np.trace(counts) / counts.sum())
+
     def _stride(self, dt: float) -> int:
         return max(1, round(self.horizon / dt))
 

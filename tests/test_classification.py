@@ -124,6 +124,7 @@ class TestClassifier:
         posed, plain = TrajectoryClassifier(models, motions), TrajectoryClassifier(models)
         np.testing.assert_array_equal(posed.confusion(shown), [[3, 0], [0, 3]])
         np.testing.assert_array_equal(plain.confusion(shown), [[0, 3], [3, 0]])
+        assert (posed.accuracy(shown), plain.accuracy(shown)) == (1.0, 0.0)
 
     def test_what_cannot_be_is_refused(self):
         models, motions = two()

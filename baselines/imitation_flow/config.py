@@ -12,7 +12,10 @@ MOST_LOG_SCALE = 2.0
 """With 2 the inverse has been seen to be off by more than the motion's size in single precision."""
 
 STEPS, CYCLE_STEPS = 5000, 1500
-"""Steps of Adam by default, where motions end and where they repeat."""
+"""Default of `n_steps`, where motions end and where they repeat."""
+
+SHARPNESS, CYCLE_SHARPNESS = 3.0, 1.5
+"""Default of `sharpness`, where motions end and where they repeat."""
 
 Noise = Literal["additive", "vanishing"]
 
@@ -38,9 +41,10 @@ class ImitationFlowConfig:
     log_scale_bound: float = 0.35
     """Bound c of a layer's log-scale, c tanh(s / c): small enough that the inverse is exact in
     floating point, see the method's page."""
-    sharpness: float = 3.0
+    sharpness: float | None = None
     """Slope of the conditioners' units at the start, in the inverse of half the motion's size:
-    larger bends sharper corners and generalises less."""
+    larger bends sharper corners and generalises less. None takes 3 where motions end and 1.5 where
+    they repeat: recorded cycles are followed as well, and the field around them waves less."""
     n_steps: int | None = None
     """Steps of Adam. None takes 5000 where motions end and 1500 where they repeat, which is one
     stage instead of two."""
@@ -103,8 +107,9 @@ class ImitationFlowConfig:
             "log_scale_bound", "sharpness", "learning_rate", "max_gradient_norm", "min_decay",
             "calm_speed", "tube_width", "spline_bound",
         ):  # fmt: skip
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"Expected a finite {name} > 0, got {getattr(self, name)}.")
+            value = getattr(self, name)
+            if not (name == "sharpness" and value is None) and not 0 < value < math.inf:
+                raise ValueError(f"Expected a finite {name} > 0, got {value}.")
         if self.log_scale_bound > MOST_LOG_SCALE:
             raise ValueError(
                 f"Expected log_scale_bound <= {MOST_LOG_SCALE}, got {self.log_scale_bound}: the "
@@ -123,3 +128,9 @@ class ImitationFlowConfig:
         if self.n_steps is not None:
             return self.n_steps
         return CYCLE_STEPS if cyclic else STEPS
+
+    def slope(self, *, cyclic: bool) -> float:
+        """Return the slope of the units at the start for motions that repeat or end."""
+        if self.sharpness is not None:
+            return self.sharpness
+        return CYCLE_SHARPNESS if cyclic else SHARPNESS

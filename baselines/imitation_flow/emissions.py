@@ -26,13 +26,18 @@ FIELDS: dict[str, type[FlowField]] = {
 
 
 def make_flow(
-    config: ImitationFlowConfig, n_dims: int, n_context: int, generators: list[torch.Generator]
+    config: ImitationFlowConfig,
+    n_dims: int,
+    n_context: int,
+    generators: list[torch.Generator],
+    *,
+    cyclic: bool = False,
 ) -> Flow:
-    """Return an untrained flow, one model for each generator."""
+    """Return an untrained flow for motions that end or repeat, one model for each generator."""
     sizes = (n_dims, config.n_layers, config.n_hidden, n_context)
     shape: dict[str, Any] = {
         "log_scale_bound": config.log_scale_bound,
-        "sharpness": config.sharpness,
+        "sharpness": config.slope(cyclic=cyclic),
         "generators": generators,
     }
     if config.emission == "spline":

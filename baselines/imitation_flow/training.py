@@ -150,7 +150,8 @@ def _train(
     )
     data = Recordings(tasks, device)
     generators = [torch.Generator().manual_seed(int(rng.integers(2**63))) for rng in rngs]
-    flow = make_flow(config, data.n_dims, tasks[0].n_context, generators).to(device)
+    sizes = (data.n_dims, tasks[0].n_context)
+    flow = make_flow(config, *sizes, generators, cyclic=data.cyclic).to(device)
     latent = _make_latent(config, tasks).to(device)
     draws = Draws(rngs, _numbers_a_step(config, data), device)
     n_steps = config.steps(cyclic=data.cyclic)

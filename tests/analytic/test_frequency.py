@@ -5,7 +5,7 @@ import pytest
 
 from iflow_gym import Demonstrations
 from iflow_gym.baselines.imitation_flow import ImitationFlow, frequency
-from iflow_gym.baselines.imitation_flow.config import CYCLE_STEPS, STEPS, ImitationFlowConfig
+from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Frame, Task
 
 
@@ -57,8 +57,7 @@ def test_less_than_a_round_and_a_half_says_nothing():
 
 def recordings(periods, given, dt=0.01, n_rounds=3.3):
     paths = [
-        ring(round(n_rounds * p / dt), p / dt, phase, (3.0, 1.0))
-        for phase, p in enumerate(periods)
+        ring(round(n_rounds * p / dt), p / dt, phase, (3.0, 1.0)) for phase, p in enumerate(periods)
     ]
     return Demonstrations.from_arrays(paths, dt=dt, period=given, name="ring")
 
@@ -90,9 +89,14 @@ class TestTempo:
         assert 4.49 * 2 * np.pi / (turned[-1] - turned[0]) == pytest.approx(1.5, rel=0.01)
 
 
-def test_steps_are_fewer_where_motions_repeat_and_the_given_where_they_are_given():
-    assert ImitationFlowConfig().steps(cyclic=False) == STEPS
-    assert ImitationFlowConfig().steps(cyclic=True) == CYCLE_STEPS
-    assert ImitationFlowConfig(n_steps=7).steps(cyclic=True) == 7
-    with pytest.raises(ValueError, match="whole number n_steps >= 1, got 0"):
-        ImitationFlowConfig(n_steps=0)
+@pytest.mark.parametrize(("cyclic", "steps", "slope"), [(False, 5000, 3.0), (True, 1500, 1.5)])
+def test_defaults_are_those_of_the_kind_of_motion_until_they_are_given(cyclic, steps, slope):
+    config, given = ImitationFlowConfig(), ImitationFlowConfig(n_steps=7, sharpness=2.0)
+    assert (config.steps(cyclic=cyclic), config.slope(cyclic=cyclic)) == (steps, slope)
+    assert (given.steps(cyclic=cyclic), given.slope(cyclic=cyclic)) == (7, 2.0)
+
+
+@pytest.mark.parametrize("setting", [{"n_steps": 0}, {"sharpness": 0.0}])
+def test_what_is_given_is_checked(setting):
+    with pytest.raises(ValueError, match=f"{next(iter(setting))} >=? ?[01], got 0"):
+        ImitationFlowConfig(**setting)
