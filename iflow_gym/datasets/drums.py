@@ -40,7 +40,7 @@ DRUMS: Final = (RIGHT, LEFT)
 """The kit of `iflow/Drumming-v0`; a hit's `drum` is an index into it."""
 
 FILE: Final = "drums.npz"
-SHA256: Final = ""
+SHA256: Final = "ddeb8c8b3e3ee31577fc66157f2333e5d7bf72bd6d663df2336641bf7269333f"
 
 
 @lru_cache(maxsize=1)
