@@ -13,6 +13,10 @@ POINT_MASS_ID = "iflow/PointMass-v0"
 """The id that takes the caller's own `demonstrations`."""
 
 
+DRUMMING_ID = "iflow/Drumming-v0"
+DRUMMING_RECORDED_ID = "iflow/DrummingRecorded-v0"
+
+
 def lasa_id(shape: str) -> str:
     """Return the id of a LASA shape."""
     return f"iflow/LASA-{shape}-v0"
@@ -23,13 +27,17 @@ def register_all() -> None:
     _register(POINT_MASS_ID, "point_mass:PointMassEnv", "point_mass_vector:PointMassVectorEnv")
     for shape in SHAPES:
         _register(lasa_id(shape), "lasa:LASAEnv", "lasa:LASAVectorEnv", shape=shape)
+    _register(DRUMMING_ID, "drumming.env:DrummingEnv")
+    _register(DRUMMING_RECORDED_ID, "drumming.recorded:DrummingRecordedEnv")
 
 
-def _register(env_id: str, entry_point: str, vector_entry_point: str, **kwargs: object) -> None:
+def _register(
+    env_id: str, entry_point: str, vector_entry_point: str | None = None, **kwargs: object
+) -> None:
     if env_id not in gymnasium.registry:
         gymnasium.register(
             env_id,
             entry_point=f"iflow_gym.envs.{entry_point}",
-            vector_entry_point=f"iflow_gym.envs.{vector_entry_point}",
+            vector_entry_point=vector_entry_point and f"iflow_gym.envs.{vector_entry_point}",
             kwargs=kwargs,
         )

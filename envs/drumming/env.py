@@ -352,7 +352,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._running = True
         self._tip = self.simulation.tip
         self._trail = [self._tip] if self.render_mode is not None else []
-        return self._observation(), self._info(self._tip, 1.0, ())
+        return self._observation(), self._info(self._tip, 1.0, (), self._field().distance(self._tip))
 
     def _place_at_demonstration(self, index: int, *, noisy: bool) -> None:
         first = self.demonstrations.positions[index][0]
@@ -417,16 +417,18 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         is_force = isinstance(self.perturbation, ForcePush)
         hits = simulation.advance(torque, self._push if pushing and is_force else None)
         reached = simulation.tip
-        reward = self._field().reward(before, reached, CONTROL_DT)
+        reward, distance = self._field().of_step(before, reached, CONTROL_DT)
+        self._tip = reached
         if pushing and not is_force:
             simulation.displace(self._push)
-        self._tip = simulation.tip
+            self._tip = simulation.tip
+            distance = self._field().distance(self._tip)
         truncated = self._count >= self._length
         if truncated:
             hits += simulation.pending_hits()
         if self.render_mode is not None:
             self._trail.append(self._tip)
-        info = self._info(reached if target is None else target, scale, tuple(hits))
+        info = self._info(reached if target is None else target, scale, tuple(hits), distance)
         return self._observation(), reward, False, truncated, info
 
     def _field(self) -> Progress:
@@ -434,8 +436,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
             self._progress = progress_along(self.demonstrations)
         return self._progress
 
-    def _info(self, target: FloatArray, scale: float, hits: tuple[Hit, ...]) -> dict[str, Any]:
-        distance = self._field().distance(self._tip)
+    def _info(
+        self, target: FloatArray, scale: float, hits: tuple[Hit, ...], distance: float
+    ) -> dict[str, Any]:
         return {
             "is_success": distance <= ON_ORBIT * self.diagonal,
             "distance_to_orbit": distance,

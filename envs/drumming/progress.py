@@ -6,7 +6,9 @@ speed, w a twentieth of the diagonal of the demonstrations' bounding box and u t
 
     n = (t_k + (p_k - m) / w) / ||t_k + (p_k - m) / w||,      r = <u, n> / max(||u||, s_k).
 
-r is in [-1, 1]: about 1 for a replay, 0 for standing still, -1 for going back.
+r is in [-1, 1]: about 1 for a replay, 0 for standing still, -1 for going back. On the heads, where
+the way down and the way up lie side by side, the nearest sample may belong to the other one: a
+replay of `iflow/Drumming-v0` has some steps there that cost, and a mean of 0.95 to 0.99.
 """
 
 from __future__ import annotations
@@ -39,21 +41,29 @@ class Progress:
         self._samples = cKDTree(points[moving])
         self._ahead = points[moving] / width + flow[moving] / speeds[moving, None]
         self._speeds = speeds[moving]
-        self._orbit = cKDTree(points)
 
-    def reward(self, x: FloatArray, x_next: FloatArray, dt: float) -> float:
-        """Return the reward of a step from x to x_next, each of shape (3,)."""
+    def of_step(self, x: FloatArray, x_next: FloatArray, dt: float) -> tuple[float, float]:
+        """Return a step's reward, and how far in m its end is from the demonstrations.
+
+        Parameters
+        ----------
+        x, x_next : arrays, shape (3,)
+            Where the step begins and ends, in m.
+        dt : float
+            Seconds a step.
+        """
         middle = (x + x_next) * 0.5
-        nearest = self._samples.query(middle)[1]
+        distances, (nearest, _) = self._samples.query(np.stack([middle, x_next]))
         guide = self._ahead[nearest] - middle * self._per_width
         step = x_next - x
         pace = max(float(np.sqrt(step @ step)), float(self._speeds[nearest]) * dt)
         norm = max(float(np.sqrt(guide @ guide)), 1e-12)
-        return min(max(float(step @ guide) / (norm * pace), -1.0), 1.0)
+        reward = float(step @ guide) / (norm * pace)
+        return min(max(reward, -1.0), 1.0), float(distances[1])
 
     def distance(self, x: FloatArray) -> float:
-        """Return the distance from the nearest sample in m."""
-        return float(self._orbit.query(x)[0])
+        """Return the distance of a position, shape (3,), from the demonstrations in m."""
+        return float(self._samples.query(x)[0])
 
 
 @lru_cache(maxsize=16)

@@ -205,12 +205,12 @@ def _add_drum(world: ElementTree.Element, drum: Drum) -> None:
         **HEAD_CONTACT,
     )  # fmt: skip
     _element(
-        body, "geom", name=f"shell:{drum.name}", type="cylinder", material=f"shell",
-        size=[radius + 0.004, depth / 2], pos=[0, 0, -0.006 - depth / 2], contype=2, conaffinity=4,
+        body, "geom", name=f"shell:{drum.name}", type="cylinder", material="shell",
+        size=[radius + 0.004, depth / 2], pos=[0, 0, -0.008 - depth / 2], contype=2, conaffinity=4,
     )  # fmt: skip
-    for height in (-0.012, -depth + 0.004):
+    for height in (-0.009, -depth + 0.004):
         _element(
-            body, "geom", type="cylinder", material="metal", size=[radius + 0.007, 0.006],
+            body, "geom", type="cylinder", material="metal", size=[radius + 0.007, 0.007],
             pos=[0, 0, height], contype=0, conaffinity=0,
         )  # fmt: skip
     for angle in 2 * np.pi * (np.arange(3) / 3) + np.pi / 6:
@@ -224,7 +224,7 @@ def _add_drum(world: ElementTree.Element, drum: Drum) -> None:
 
 def _add_surroundings(world: ElementTree.Element) -> None:
     _element(
-        world, "geom", name="floor", type="plane", size=[3, 3, 0.1], material="floor",
+        world, "geom", name="floor", type="plane", size=[0, 0, 0.1], material="floor",
         contype=2, conaffinity=4,
     )  # fmt: skip
     _element(world, "light", pos=[1.2, -0.8, 2.2], dir=[-0.5, 0.4, -1], diffuse=[0.6] * 3)
@@ -248,7 +248,7 @@ def _add_look(root: ElementTree.Element) -> None:
         assets, "texture", name="floor", type="2d", builtin="checker", rgb1="0.78 0.79 0.81",
         rgb2="0.72 0.73 0.76", width=256, height=256,
     )  # fmt: skip
-    _element(assets, "material", name="floor", texture="floor", texrepeat=[12, 12], reflectance=0.05)
+    _element(assets, "material", name="floor", texture="floor", texrepeat=[2, 2], texuniform="true")
     _element(assets, "material", name="wood", rgba="0.76 0.58 0.36 1")
     _element(assets, "material", name="skin", rgba="0.97 0.96 0.92 1")
     _element(assets, "material", name="metal", rgba="0.6 0.62 0.65 1", specular=0.8)

@@ -209,3 +209,217 @@ def implied_score(
     notes.sort()
     times = np.array([t for t, _ in notes], dtype=np.float64)
     return times, np.array([d for _, d in notes], dtype=np.intp)
+
+
+def match(
+    score_times: ArrayLike,
+    score_drums: ArrayLike,
+    hit_times: ArrayLike,
+    hit_drums: ArrayLike,
+    tolerance: float = TOLERANCE,
+) -> Matching:
+    """Match notes and hits one to one.
+
+    A hit can be a note of its own drum that is at most the tolerance away. Of all matchings, one
+    with the most pairs is taken, and among those one with the least sum of time differences (a
+    linear assignment).
+
+    Parameters
+    ----------
+    score_times, score_drums
+        What is to be played, shape (n,) each: seconds and indices.
+    hit_times, hit_drums
+        What was played, shape (m,) each.
+    tolerance
+        In s, inclusive (to a nanosecond).
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, times are not finite, drums are not whole numbers, or the tolerance
+        is not positive.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    notes_at, notes_on = _played(score_times, score_drums, "score")
+    hits_at, hits_on = _played(hit_times, hit_drums, "hit")
+    apart = np.abs(notes_at[:, None] - hits_at[None, :])
+    allowed = (notes_on[:, None] == hits_on[None, :]) & (
+        apart <= positive(tolerance, "tolerance") + 1e-9
+    )
+    # Any number of allowed pairs is together cheaper than one more pair that is not allowed.
+    forbidden = (min(apart.shape) + 1) * (tolerance + 1e-9)
+    rows, columns = linear_sum_assignment(np.where(allowed, apart, forbidden))
+    kept = allowed[rows, columns]
+    pairs = int(kept.sum())
+    return Matching(
+        np.asarray(rows[kept], dtype=np.intp),
+        np.asarray(columns[kept], dtype=np.intp),
+        missed=len(notes_at) - pairs,
+        extra=len(hits_at) - pairs,
+    )
+
+
+def hit_f1(
+    score_times: ArrayLike,
+    score_drums: ArrayLike,
+    hit_times: ArrayLike,
+    hit_drums: ArrayLike,
+    tolerance: float = TOLERANCE,
+) -> float:
+    r"""F1 of the hits: the harmonic mean of the notes' share hit and the hits' share in the score.
+
+    .. math:: F_1 = \frac{2 m}{n_\text{notes} + n_\text{hits}}
+
+    with m pairs of `match`.
+
+    Parameters
+    ----------
+    score_times, score_drums, hit_times, hit_drums, tolerance
+        As in `match`, whose errors are raised.
+
+    Returns
+    -------
+    float
+        In [0, 1]; 1 for silence that was asked for.
+    """
+    notes, hits = np.size(score_times), np.size(hit_times)
+    pairs = len(match(score_times, score_drums, hit_times, hit_drums, tolerance).notes)
+    return 2.0 * pairs / (notes + hits) if notes + hits else 1.0
+
+
+def missed(
+    score_times: ArrayLike,
+    score_drums: ArrayLike,
+    hit_times: ArrayLike,
+    hit_drums: ArrayLike,
+    tolerance: float = TOLERANCE,
+) -> int:
+    """Notes that no hit matches; parameters as in `match`."""
+    return match(score_times, score_drums, hit_times, hit_drums, tolerance).missed
+
+
+def extra(
+    score_times: ArrayLike,
+    score_drums: ArrayLike,
+    hit_times: ArrayLike,
+    hit_drums: ArrayLike,
+    tolerance: float = TOLERANCE,
+) -> int:
+    """Hits that match no note; parameters as in `match`."""
+    return match(score_times, score_drums, hit_times, hit_drums, tolerance).extra
+
+
+def timing_error(
+    score_times: ArrayLike,
+    score_drums: ArrayLike,
+    hit_times: ArrayLike,
+    hit_drums: ArrayLike,
+    tolerance: float = TOLERANCE,
+) -> float:
+    """Mean absolute time between matched notes and hits, in ms.
+
+    Parameters
+    ----------
+    score_times, score_drums, hit_times, hit_drums, tolerance
+        As in `match`, whose errors are raised.
+
+    Returns
+    -------
+    float
+        At most the tolerance: what lies beyond it is no match, and shows in `hit_f1`. Infinity
+        where nothing matches, 0 for silence that was asked for.
+    """
+    pairs = match(score_times, score_drums, hit_times, hit_drums, tolerance)
+    if len(pairs.notes) == 0:
+        return 0.0 if pairs.missed + pairs.extra == 0 else float("inf")
+    apart = np.asarray(score_times, dtype=np.float64)[pairs.notes] - np.asarray(
+        hit_times, dtype=np.float64
+    )[pairs.hits]
+    return 1000.0 * float(np.abs(apart).mean())
+
+
+def tempo_error(
+    score_times: ArrayLike, score_drums: ArrayLike, hit_times: ArrayLike, hit_drums: ArrayLike
+) -> float:
+    r"""How far off the tempo is, as a fraction of the score's.
+
+    .. math:: |\hat T - T| / T
+
+    with T the duration of a round: the median interval between successive notes of the same drum,
+    over all drums, and T^ the same of the hits.
+
+    Parameters
+    ----------
+    score_times, score_drums, hit_times, hit_drums
+        As in `match`.
+
+    Returns
+    -------
+    float
+        Infinity where no drum was hit twice.
+
+    Raises
+    ------
+    ValueError
+        If `match`'s conditions do not hold, or the score has no drum with two notes.
+    """
+    wanted = _round(*_played(score_times, score_drums, "score"))
+    if wanted is None:
+        raise ValueError("Expected a score with two notes on one drum: a shorter one has no tempo")
+    found = _round(*_played(hit_times, hit_drums, "hit"))
+    return float("inf") if found is None else abs(found - wanted) / wanted
+
+
+def tracking_rmse(commanded: ArrayLike, reached: ArrayLike) -> float:
+    r"""How far the tip is from where it was commanded to be, in mm.
+
+    .. math:: 1000 \sqrt{\frac{1}{T} \sum_t \lVert x_t - \hat x_t \rVert^2}
+
+    Parameters
+    ----------
+    commanded, reached
+        Positions of the tip at the same instants in m, shape (T, d).
+
+    Returns
+    -------
+    float
+        Infinity if a position that was reached is not finite.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or are no trajectories, or a command is not finite.
+    """
+    wanted = np.asarray(commanded, dtype=np.float64)
+    found = np.asarray(reached, dtype=np.float64)
+    if wanted.ndim != 2 or wanted.shape != found.shape or wanted.size == 0:
+        raise ValueError(
+            f"Expected two trajectories of one shape (T, d), got {wanted.shape} and {found.shape}"
+        )
+    if not np.isfinite(wanted).all():
+        raise ValueError("Expected finite commands, got nan or infinity")
+    if not np.isfinite(found).all():
+        return float("inf")
+    return 1000.0 * float(np.sqrt(((wanted - found) ** 2).sum(axis=1).mean()))
+
+
+def _played(times: ArrayLike, drums: ArrayLike, name: str) -> tuple[FloatArray, IntArray]:
+    at, on = np.asarray(times, dtype=np.float64), np.asarray(drums)
+    if at.ndim != 1 or at.shape != on.shape:
+        raise ValueError(
+            f"Expected {name}_times and {name}_drums of one shape (n,), got {at.shape} and "
+            f"{on.shape}"
+        )
+    if not np.isfinite(at).all():
+        raise ValueError(f"Expected finite {name}_times, got nan or infinity")
+    if at.size and on.dtype.kind not in "iu":
+        raise ValueError(f"Expected {name}_drums to be whole numbers, got {on.dtype}")
+    return at, on.astype(np.intp)
+
+
+def _round(times: FloatArray, drums: IntArray) -> float | None:
+    """Return the median interval between successive strokes on the same drum, if there is one."""
+    intervals = [np.diff(np.sort(times[drums == drum])) for drum in np.unique(drums)]
+    together = np.concatenate(intervals) if intervals else np.zeros(0)
+    return float(np.median(together)) if together.size else None
