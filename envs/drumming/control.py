@@ -14,10 +14,14 @@ with which every joint keeps its speed limit and its distance to its stops, and 
 to the workspace's border: near a stop or the border the allowed approach is (distance) / 0.1 s.
 So a command that cannot be carried out is slowed as a whole, and never bent.
 
+Acceleration. v is not the command itself but the tip's present velocity plus the change to the
+command, shortened to `TIP_ACCELERATION` dt. Far below what the motors could do, it is what makes
+the arm gentle: on a drum head, which stops the tip, it pushes with at most about the tip's inertia
+(1.2 kg) times that, 25 N, whatever is commanded.
+
 Torques. tau = M (dq - dq_now) / dt + h brings the joints to dq within one control step, M the
-inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). If a joint's
-torque limit is exceeded, the first term is scaled down as a whole. Contacts are not in this model:
-a drum head stops the tip, and the controller pushes with about M_tip v / dt, some tens of newtons.
+inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). Each joint's
+torque is cut at its motor's limit; commands in free space stay well below.
 """
 
 from __future__ import annotations
@@ -35,6 +39,9 @@ CONTROL_DT: Final = 0.01
 
 POSTURE: Final = np.array([0.0, -0.72, 0.0, -2.4, 0.0, 0.47, 0.0])
 """q_0 in rad: elbow up, the arm in its plane of symmetry."""
+
+TIP_ACCELERATION: Final = 20.0
+"""Greatest acceleration of the tip that a command brings about, in m/s^2."""
 
 ORIENTATION_GAIN: Final = 15.0
 """k in 1/s."""
@@ -83,9 +90,7 @@ class Workspace:
     def scale(cls, point: FloatArray, velocity: FloatArray) -> float:
         """Return how much of a velocity is allowed at a point."""
         worst = 1.0
-        for x, v, low, high in zip(
-            point.tolist(), velocity.tolist(), _LOW, _HIGH, strict=True
-        ):
+        for x, v, low, high in zip(point.tolist(), velocity.tolist(), _LOW, _HIGH, strict=True):
             outward = v * BRAKING_TIME
             if outward > high - x and v > 0:
                 worst = min(worst, max(high - x, 0.0) / outward)
@@ -132,6 +137,7 @@ class Controller:
         wanted = self._wanted
         wanted[:, 0] = -jacobian @ resting
         wanted[3:, 0] += ORIENTATION_GAIN * self.rotation_error()
+        velocity = self._eased(velocity, jacobian)
         wanted[:3, 1] = velocity
         task = jacobian.T @ np.linalg.solve(self._damped(jacobian), wanted)
         low, high = self.speed_limits()
@@ -141,6 +147,14 @@ class Controller:
         if scale > 0.0:
             scale = min(scale, Workspace.scale(data.site_xpos[self.scene.tip], velocity))
         return JointCommand(free + scale * commanded, scale)
+
+    def _eased(self, velocity: FloatArray, jacobian: FloatArray) -> FloatArray:
+        """Return the velocity that the tip's acceleration limit lets it have after this step."""
+        present = jacobian[:3] @ self.data.qvel
+        change = velocity - present
+        size = float(np.sqrt(change @ change))
+        most = TIP_ACCELERATION * CONTROL_DT
+        return velocity if size <= most else present + (most / size) * change
 
     def rotation_error(self) -> FloatArray:
         """Return e, which turns the stick back into its fixed orientation, in rad, shape (3,)."""
@@ -167,7 +181,8 @@ class Controller:
         data = self.data
         change = (velocity - data.qvel) / CONTROL_DT
         mujoco.mj_mulM(self.scene.model, data, self._moved, change)
-        return _within_torque_limits(self.going_on(), self._moved)
+        torque = self.going_on() + self._moved
+        return np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
 
     def going_on(self) -> FloatArray:
         """Return h, the torques that keep the joint velocities, shape (7,)."""
@@ -200,8 +215,3 @@ def _largest_scale(free: FloatArray, part: FloatArray, low: FloatArray, high: Fl
     if not over.any():
         return 1.0
     return float(max((room[over] / size[over]).min(), 0.0))
-
-
-def _within_torque_limits(base: FloatArray, part: FloatArray) -> FloatArray:
-    base = np.minimum(np.maximum(base, -TORQUE_LIMITS), TORQUE_LIMITS)
-    return base + _largest_scale(base, part, -TORQUE_LIMITS, TORQUE_LIMITS) * part

@@ -15,8 +15,8 @@ from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, Drum, load_drums
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.envs.drumming.control import CONTROL_DT, Workspace
 from iflow_gym.envs.drumming.progress import Progress, progress_along
-from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS
-from iflow_gym.envs.drumming.simulation import Simulation, Unreachable
+from iflow_gym.envs.drumming.scene import TORQUE_LIMITS
+from iflow_gym.envs.drumming.simulation import Simulation, UnreachableError
 from iflow_gym.envs.dynamics import scaled_into_box
 from iflow_gym.envs.task import RESET_OPTIONS, START_NOISE, Push
 from iflow_gym.metrics.drumming import Hit, implied_score
@@ -102,10 +102,11 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     | part | size | quantity | min | max | unit |
     | --- | --- | --- | --- | --- | --- |
-    | `"tip"` (default) | 3 | position of the tip | -1.5 | 1.5 | m |
+    | `"tip"` (default) | 3 | position of the tip | -2 | 2 | m |
     | `"tip_velocity"` | 3 | velocity of the tip | -10 | 10 | m/s |
-    | `"joints"` | 7 + 7 | joint angles; joint velocities | limits - 0.1; -20 | limits + 0.1; 20 | rad; rad/s |
-    | `"force"` | 2 | largest normal force on each head in the last step | 0 | 2000 | N |
+    | `"joints"` | 7 | joint angles | limits - 0.1 | limits + 0.1 | rad |
+    | | 7 | joint velocities | -20 | 20 | rad/s |
+    | `"force"` | 2 | largest force on each head in the last step | 0 | 2000 | N |
     | `"phase"` | 2 | cosine and sine of 2 pi time / period | -1 | 1 | - |
 
     The tip is kept within the workspace: x from 0.58 to 0.88, y from -0.4 to 0.4, z from 0.13 to
@@ -131,13 +132,13 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     ## Arguments
     | argument | default | meaning |
     | --- | --- | --- |
-    | `demonstrations` | `None` | 3-D demonstrations of a cycle in the workspace; `None` takes the suite's six |
+    | `demonstrations` | `None` | of a cycle within the workspace; `None` takes the suite's six |
     | `drums` | `None` | tuple of `iflow_gym.datasets.drums.Drum`; `None` takes the suite's two |
     | `control_mode` | `"velocity"` | or `"torque"` |
     | `observe` | `("tip",)` | parts of the observation |
     | `horizon` | `None` | steps an episode; `None` takes the demonstration's own |
     | `start_noise` | `0.02` | standard deviation of random starts, in diagonals |
-    | `perturbation` | `None` | a `Push` moves the arm aside at once, a `ForcePush` pushes the stick's tip for 0.1 s; both are of the middle of a stroke with `fraction=0.5` |
+    | `perturbation` | `None` | a `Push` or a `ForcePush`, see Perturbations |
     | `render_mode` | `None` | `"rgb_array"`; needs OpenGL |
     | `width`, `height` | `640`, `480` | of a picture, in pixels |
 
@@ -182,9 +183,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._demonstrations = _checked(load_drums() if demonstrations is None else demonstrations)
         self.drums: tuple[Drum, ...] = DRUMS if drums is None else tuple(drums)
         if control_mode not in ("velocity", "torque"):
-            raise ValueError(
-                f"Expected control_mode 'velocity' or 'torque', got {control_mode!r}."
-            )
+            raise ValueError(f"Expected control_mode 'velocity' or 'torque', got {control_mode!r}.")
         if horizon is not None and (not isinstance(horizon, int | np.integer) or horizon < 1):
             raise ValueError(
                 f"Expected horizon to be a whole number of steps >= 1, got {horizon!r}: leave it "
@@ -262,7 +261,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         for point in np.asarray(points, dtype=np.float64).reshape(-1, 3):
             try:
                 self.simulation.place(point)
-            except Unreachable:
+            except UnreachableError:
                 found.append(False)
             else:
                 found.append(True)
@@ -352,7 +351,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._running = True
         self._tip = self.simulation.tip
         self._trail = [self._tip] if self.render_mode is not None else []
-        return self._observation(), self._info(self._tip, 1.0, (), self._field().distance(self._tip))
+        return self._observation(), self._info(
+            self._tip, 1.0, (), self._field().distance(self._tip)
+        )
 
     def _place_at_demonstration(self, index: int, *, noisy: bool) -> None:
         first = self.demonstrations.positions[index][0]
@@ -362,7 +363,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
                 noise = self.start_noise * self.diagonal * self.np_random.standard_normal(3)
                 try:
                     return self.simulation.place(first + noise, velocity)
-                except Unreachable:
+                except UnreachableError:
                     continue
         return self.simulation.place(first, velocity)
 
@@ -469,7 +470,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     def _observation_space(self) -> spaces.Space[FloatArray]:
         scene, n = self.simulation.scene, len(self.drums)
         high = {
-            "tip": np.full(3, 1.5),
+            "tip": np.full(3, 2.0),
             "tip_velocity": np.full(3, 10.0),
             "joints": np.concatenate([scene.upper + 0.1, np.full(7, 20.0)]),
             "force": np.full(n, 2000.0),

@@ -7,6 +7,7 @@ import importlib
 import os
 import weakref
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Final
 
 import mujoco
@@ -90,7 +91,7 @@ class Renderer:
             mujoco.mjtCatBit.mjCAT_ALL.value, self._scene,
         )  # fmt: skip
         recent = list(trail[-TRAIL:])
-        for age, (begin, end) in enumerate(zip(recent[:-1], recent[1:], strict=True)):
+        for age, (begin, end) in enumerate(pairwise(recent)):
             self._add_line(begin, end, (age + 1) / len(recent))
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)

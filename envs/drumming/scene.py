@@ -51,6 +51,9 @@ STICK_PITCH: Final = np.radians(20.0)
 HEAD_CONTACT: Final = {"solref": "0.03 0.8", "solimp": "0.9 0.95 0.002", "friction": "0.4"}
 """Contact of stick and head: soft enough to be smooth at the physics step."""
 
+CAMERA: Final = (1.80, -1.15, 0.98)
+CAMERA_TARGET: Final = (0.38, 0.02, 0.36)
+
 MISSING: Final = (
     "The arm's model ships inside gymnasium-robotics, which was not found: install it with "
     "`pip install gymnasium-robotics`."
@@ -120,7 +123,13 @@ def scene_xml(drums: Sequence[Drum]) -> str:
     _element(root, "size", nuser_actuator=5)  # the arm's defaults have user data
     visual = _element(root, "visual")
     _element(visual, "global", offwidth=1280, offheight=960)
-    _element(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.35 0.35 0.35")
+    _element(
+        visual,
+        "headlight",
+        ambient="0.45 0.45 0.45",
+        diffuse="0.35 0.35 0.35",
+        specular="0.1 0.1 0.1",
+    )
     _element(visual, "quality", shadowsize=4096, offsamples=8)
     for part in ElementTree.parse(folder / "assets.xml").getroot():
         if part.tag in ("asset", "default"):
@@ -232,10 +241,15 @@ def _add_surroundings(world: ElementTree.Element) -> None:
         world, "light", pos=[0.2, 1.5, 2.0], dir=[0.2, -0.7, -1], diffuse=[0.25] * 3,
         castshadow="false",
     )  # fmt: skip
-    _element(
-        world, "camera", name="front", pos=[1.75, -0.85, 1.0], fovy=38,
-        xyaxes=[0.47, 0.88, 0, -0.36, 0.19, 0.91],
-    )  # fmt: skip
+    _element(world, "camera", name="front", fovy=33, **_view(CAMERA, CAMERA_TARGET))
+
+
+def _view(eye: Sequence[float], target: Sequence[float]) -> dict[str, Any]:
+    """Return where a camera is and how it is turned, upright, to look at a point."""
+    back = np.subtract(eye, target)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    up = np.cross(back, right)
+    return {"pos": eye, "xyaxes": [*(right / np.linalg.norm(right)), *(up / np.linalg.norm(up))]}
 
 
 def _add_look(root: ElementTree.Element) -> None:
@@ -245,10 +259,18 @@ def _add_look(root: ElementTree.Element) -> None:
         rgb2="0.75 0.8 0.86", width=64, height=384,
     )  # fmt: skip
     _element(
-        assets, "texture", name="floor", type="2d", builtin="checker", rgb1="0.78 0.79 0.81",
-        rgb2="0.72 0.73 0.76", width=256, height=256,
+        assets, "texture", name="floor", type="2d", builtin="checker", rgb1="0.88 0.89 0.90",
+        rgb2="0.80 0.81 0.83", width=256, height=256,
     )  # fmt: skip
-    _element(assets, "material", name="floor", texture="floor", texrepeat=[2, 2], texuniform="true")
+    _element(
+        assets,
+        "material",
+        name="floor",
+        texture="floor",
+        texrepeat=[2, 2],
+        texuniform="true",
+        specular=0.1,
+    )
     _element(assets, "material", name="wood", rgba="0.76 0.58 0.36 1")
     _element(assets, "material", name="skin", rgba="0.97 0.96 0.92 1")
     _element(assets, "material", name="metal", rgba="0.6 0.62 0.65 1", specular=0.8)

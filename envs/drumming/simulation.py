@@ -25,7 +25,7 @@ OVERLAP: Final = 0.0005
 """A posture in which stick and drum overlap by more than this, in m, is no start."""
 
 
-class Unreachable(ValueError):
+class UnreachableError(ValueError):
     """A position that the arm cannot take with the tip of its stick."""
 
 
@@ -69,7 +69,7 @@ class Simulation:
 
         Raises
         ------
-        Unreachable
+        UnreachableError
             If the arm cannot hold the tip there, or the stick would be in a drum.
         """
         self._detector.reset()
@@ -78,7 +78,9 @@ class Simulation:
         self._solve(tip, POSTURE)
         self._check_clear(tip)
         if velocity is not None:
-            self.data.qvel[:] = self.controller.joint_command(velocity, self.data.qpos).velocity
+            jacobian = self.controller.jacobian()
+            twist = np.concatenate([velocity, np.zeros(3)])
+            self.data.qvel[:] = np.linalg.lstsq(jacobian, twist, rcond=1e-3)[0]
         mujoco.mj_step1(self.model, self.data)
 
     def displace(self, by: FloatArray) -> None:
@@ -89,7 +91,7 @@ class Simulation:
             try:
                 self._solve(start + share * by, posture)
                 self._check_clear(start + share * by)
-            except Unreachable:
+            except UnreachableError:
                 continue
             break
         else:
@@ -103,7 +105,7 @@ class Simulation:
         limits.
         """
         if not Workspace.contains(tip):
-            raise Unreachable(
+            raise UnreachableError(
                 f"Expected a position within the arm's reach, got {_shown(tip)}: x, y, z from "
                 f"{_shown(Workspace.low)} to {_shown(Workspace.high)}, and at most "
                 f"{Workspace.radius} m from {_shown(Workspace.centre)}."
@@ -114,12 +116,15 @@ class Simulation:
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             jacobian = self.controller.jacobian()
-            error = np.concatenate([tip - data.site_xpos[scene.tip], self.controller.rotation_error()])
+            error = np.concatenate(
+                [tip - data.site_xpos[scene.tip], self.controller.rotation_error()]
+            )
             size = float(np.linalg.norm(error))
             drift = POSTURE_STEP * (posture - data.qpos)
             gram = jacobian @ jacobian.T + 1e-8 * np.eye(6)
             towards = np.linalg.solve(
-                gram, np.stack([min(1.0, IK_STEP / max(size, IK_STEP)) * error, jacobian @ drift], 1)
+                gram,
+                np.stack([min(1.0, IK_STEP / max(size, IK_STEP)) * error, jacobian @ drift], 1),
             )
             side = drift - jacobian.T @ towards[:, 1]
             step = jacobian.T @ towards[:, 0] + side
@@ -127,7 +132,7 @@ class Simulation:
                 return
             data.qpos[:] = np.clip(data.qpos + step, scene.lower + 0.02, scene.upper - 0.02)
         if size >= IK_TOLERANCE:
-            raise Unreachable(
+            raise UnreachableError(
                 f"Expected a position that the arm can take, got {_shown(tip)}: a joint's limit "
                 f"keeps the tip {1000 * size:.1f} mm (or mrad) away."
             )
@@ -135,7 +140,7 @@ class Simulation:
     def _check_clear(self, tip: FloatArray) -> None:
         mujoco.mj_fwdPosition(self.model, self.data)
         if self.data.ncon and float(self.data.contact.dist.min()) < -OVERLAP:
-            raise Unreachable(
+            raise UnreachableError(
                 f"Expected a position clear of the drums, got {_shown(tip)}: there the stick would "
                 "be inside a drum or the floor; start higher or further away."
             )

@@ -40,7 +40,7 @@ DRUMS: Final = (RIGHT, LEFT)
 """The kit of `iflow/Drumming-v0`; a hit's `drum` is an index into it."""
 
 FILE: Final = "drums.npz"
-SHA256: Final = "ddeb8c8b3e3ee31577fc66157f2333e5d7bf72bd6d663df2336641bf7269333f"
+SHA256: Final = "96819707e75438ad3ac51e67bed585c6f7a0759b4fc410062047a9341c9b6eaa"
 
 
 @lru_cache(maxsize=1)

@@ -99,12 +99,14 @@ def detect_hits(
     step = positive(dt, "dt")
     quiet = round(positive(refractory_time, "refractory_time") / step)
     window = max(1, round(positive(peak_window, "peak_window") / step))
-    hits = []
+    hits: list[Hit] = []
     for drum, force in enumerate(signal.T):
         above = np.flatnonzero(force >= positive(threshold, "threshold"))
         gaps = np.diff(above, prepend=-quiet - 1)
-        for onset in above[gaps > quiet].tolist():
-            hits.append(Hit(onset * step, drum, float(force[onset : onset + window].max())))
+        hits += [
+            Hit(onset * step, drum, float(force[onset : onset + window].max()))
+            for onset in above[gaps > quiet].tolist()
+        ]
     return sorted(hits)
 
 
@@ -295,7 +297,7 @@ def missed(
     hit_drums: ArrayLike,
     tolerance: float = TOLERANCE,
 ) -> int:
-    """Notes that no hit matches; parameters as in `match`."""
+    """Count the notes that no hit matches; parameters as in `match`."""
     return match(score_times, score_drums, hit_times, hit_drums, tolerance).missed
 
 
@@ -306,7 +308,7 @@ def extra(
     hit_drums: ArrayLike,
     tolerance: float = TOLERANCE,
 ) -> int:
-    """Hits that match no note; parameters as in `match`."""
+    """Count the hits that match no note; parameters as in `match`."""
     return match(score_times, score_drums, hit_times, hit_drums, tolerance).extra
 
 
@@ -333,9 +335,10 @@ def timing_error(
     pairs = match(score_times, score_drums, hit_times, hit_drums, tolerance)
     if len(pairs.notes) == 0:
         return 0.0 if pairs.missed + pairs.extra == 0 else float("inf")
-    apart = np.asarray(score_times, dtype=np.float64)[pairs.notes] - np.asarray(
-        hit_times, dtype=np.float64
-    )[pairs.hits]
+    apart = (
+        np.asarray(score_times, dtype=np.float64)[pairs.notes]
+        - np.asarray(hit_times, dtype=np.float64)[pairs.hits]
+    )
     return 1000.0 * float(np.abs(apart).mean())
 
 
