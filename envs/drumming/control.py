@@ -15,7 +15,7 @@ to the workspace's border: near a stop or the border the allowed approach is (di
 So a command that cannot be carried out is slowed as a whole, and never bent.
 
 Acceleration. v is not the command itself but the tip's present velocity plus the change to the
-command, shortened to `TIP_ACCELERATION` dt. Far below what the motors could do, it is what makes
+command, along it and across it shortened to `TIP_ACCELERATION` dt each. Far below what the motors could do, it is what makes
 the arm gentle: on a drum head, which stops the tip, it pushes with at most about the tip's inertia
 (1.2 kg) times that, 25 N, whatever is commanded.
 
@@ -152,9 +152,14 @@ class Controller:
         """Return the velocity that the tip's acceleration limit lets it have after this step."""
         present = jacobian[:3] @ self.data.qvel
         change = velocity - present
-        size = float(np.sqrt(change @ change))
         most = TIP_ACCELERATION * CONTROL_DT
-        return velocity if size <= most else present + (most / size) * change
+        if float(change @ change) <= most**2:
+            return velocity
+        # Along the command and across it apart: pressing on a head must not let the tip slide.
+        speed = float(np.sqrt(velocity @ velocity))
+        along = velocity * (float(change @ velocity) / speed**2) if speed > 0 else np.zeros(3)
+        eased = present + _shortened(along, most) + _shortened(change - along, most)
+        return np.asarray(eased, dtype=np.float64)
 
     def rotation_error(self) -> FloatArray:
         """Return e, which turns the stick back into its fixed orientation, in rad, shape (3,)."""
@@ -205,6 +210,11 @@ class Controller:
         scale = _largest_scale(kept, CONTROL_DT * both[1], low, high)
         target = kept + scale * CONTROL_DT * both[1]
         return self.torque(target), scale
+
+
+def _shortened(vector: FloatArray, most: float) -> FloatArray:
+    size = float(np.sqrt(vector @ vector))
+    return vector if size <= most else (most / size) * vector
 
 
 def _largest_scale(free: FloatArray, part: FloatArray, low: FloatArray, high: FloatArray) -> float:

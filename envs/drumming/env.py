@@ -153,10 +153,25 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     | `dt` | float | seconds a step |
     | `demonstration` | int | index of the demonstration, -1 for a start of the caller's choice |
     | `pushed` | bool | whether the push has begun |
-    | `hits` | tuple of `Hit(time, drum, force)` | that were decided in this step, 0.05 s after their onset, when their force is known; an episode's last step has those still open |
+    | `hits` | tuple | of `Hit(time, drum, force)`: what this step decided, see Hits |
     | `forces` | array, shape (2,) | largest normal force on each head in this step, N |
-    | `target` | array, shape (3,) | where the command asked the tip to be at the end of this step, m; in torque mode where the tip is |
+    | `target` | array, shape (3,) | where the command wanted the tip at the step's end, m |
     | `command_scale` | float | how much of the command the limits let through |
+
+    In torque mode `target` is where the tip is.
+
+    ## Hits
+    A contact of the stick with a head of at least 2 N that none preceded on that drum within
+    0.1 s. Its `time` is that of the onset, to the millisecond; its `force` the largest within
+    0.05 s. It is reported when that is known, 0.05 s after the onset, or in the episode's last
+    step.
+
+    ## Perturbations
+    Both come once, `fraction` of the way; 0.5 is in the middle of a stroke. A `Push(fraction,
+    size, direction)` moves the arm aside at once, so that the tip is displaced by `size` diagonals,
+    or as far as arm and drums allow; joint velocities stay. A `ForcePush(fraction, impulse,
+    duration, direction)` pushes the tip with a steady force; the controller resists, and 4 N s
+    in 0.1 s move the tip by two or three centimetres.
 
     ## Version History
     * v0: Initial version. Scores belong to a version of MuJoCo: contacts are solved slightly

@@ -41,7 +41,7 @@ class Performance(NamedTuple):
     path: FloatArray
     """Of the tip in m, shape (T, 3), the start first; nan from where the policy ran away."""
     targets: FloatArray
-    """Where each command asked the tip to be, in m, shape (T - 1, 3)."""
+    """Where each command asked the tip to be, in m, shape (T - 1, 3); 0 where there was none."""
     on_orbit: NDArray[np.bool_]
     """Shape (T - 1,)."""
     times: FloatArray
@@ -84,7 +84,6 @@ def score(system_or_policy: Any, env: DrummingEnv, seed: int) -> dict[str, float
         played = perform(system_or_policy, free, index, seed=seeds[index])
         after = perform(system_or_policy, pushed, index, seed=seeds[index])
         together = (*notes, played.times, played.drums)
-        n_steps = len(played.targets)
         rows.append(
             {
                 "hit_f1": metrics.hit_f1(*together),
@@ -92,9 +91,7 @@ def score(system_or_policy: Any, env: DrummingEnv, seed: int) -> dict[str, float
                 "tempo_error": metrics.tempo_error(*together),
                 "missed": float(metrics.missed(*together)),
                 "extra": float(metrics.extra(*together)),
-                "tracking_rmse": metrics.tracking_rmse(
-                    played.targets, played.path[1 : n_steps + 1]
-                ),
+                "tracking_rmse": metrics.tracking_rmse(played.targets, played.path[1:]),
                 "rmse": float(rmse(positions, played.path)),
                 "recovered": float(after.on_orbit[-round(RECOVERED_TIME / env.dt) :].all()),
             }
@@ -110,7 +107,7 @@ def perform(
     observation, _ = env.reset(seed=seed, options={"demonstration": demonstration})
     n_steps = len(env.demonstrations.positions[demonstration]) - 1
     path = np.full((n_steps + 1, 3), np.nan)
-    targets, on_orbit = [], np.zeros(n_steps, dtype=np.bool_)
+    targets, on_orbit = np.zeros((n_steps, 3)), np.zeros(n_steps, dtype=np.bool_)
     hits: list[metrics.Hit] = []
     path[0] = observation[:3]
     state, episode_start = None, np.ones(1, dtype=np.bool_)
@@ -123,12 +120,12 @@ def perform(
             break
         observation, _, _, _, info = env.step(action)
         path[k + 1], on_orbit[k] = observation[:3], info["is_success"]
-        targets.append(info["target"])
+        targets[k] = info["target"]
         hits += info["hits"]
         episode_start = np.zeros(1, dtype=np.bool_)
     return Performance(
         path,
-        np.array(targets).reshape(-1, 3),
+        targets,
         on_orbit,
         np.array([hit.time for hit in hits], dtype=np.float64),
         np.array([hit.drum for hit in hits], dtype=np.intp),

@@ -40,7 +40,7 @@ DRUMS: Final = (RIGHT, LEFT)
 """The kit of `iflow/Drumming-v0`; a hit's `drum` is an index into it."""
 
 FILE: Final = "drums.npz"
-SHA256: Final = "96819707e75438ad3ac51e67bed585c6f7a0759b4fc410062047a9341c9b6eaa"
+SHA256: Final = "2004da04fc2ada7052a3526d995377d3be39f7c89634410b32875c876aa4f9c6"
 
 
 @lru_cache(maxsize=1)

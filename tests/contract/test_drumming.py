@@ -22,6 +22,7 @@ from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, assets_fo
 from iflow_gym.envs.drumming.simulation import UnreachableError
 from iflow_gym.envs.task import Push
 from iflow_gym.metrics import drumming as metrics
+from iflow_gym.metrics.stability import start_grid
 from iflow_gym.registration import DRUMMING_ID, DRUMMING_RECORDED_ID
 
 both_modes = pytest.mark.parametrize("mode", ["velocity", "torque"])
@@ -239,15 +240,15 @@ def test_reachable_says_what_reset_accepts(env):
 # The controller's promises --------------------------------------------------------------------
 
 
-def test_every_start_of_the_grid_around_the_demonstrations_that_is_clear_is_reachable(env):
-    """The start grid of the metrics: the box enlarged by half a side at every end."""
-    from iflow_gym.metrics.stability import start_grid
-
-    grid = start_grid(*env.demonstrations.bounding_box, n_per_axis=4)
+def test_the_workspace_above_the_drums_is_reachable_and_holds_the_demonstrations(env):
+    """Of the metrics' grid of starts, what lies in the workspace and clear of the drums."""
+    grid = start_grid(*env.demonstrations.bounding_box, n_per_axis=5)
     found = env.reachable(grid)
-    high = grid[:, 2] > DRUMS[0].head[2] + 0.05
-    assert found[high].all()
-    assert high.mean() > 0.5
+    above = grid[:, 2] > DRUMS[0].head[2] + 0.05
+    np.testing.assert_array_equal(found[above], Workspace.contains(grid[above]))
+    assert found[above].mean() > 0.75
+    samples = np.concatenate(env.demonstrations.positions)[::250]
+    assert env.reachable(samples).all()
 
 
 @pytest.mark.parametrize("direction", np.vstack([np.eye(3), -np.eye(3)[2:], [[0.6, -0.5, 0.6]]]))
@@ -267,10 +268,8 @@ def test_unreachable_commands_saturate_and_let_go(env):
         env.reset(options={"start": MID_AIR})
         for _ in range(300):
             observation, *_, info = env.step(direction)
-        inside = Workspace.contains(observation + 0.002 * (Workspace.centre - observation))
-        on_drum = info["forces"].max() > 0
-        assert inside or on_drum
-        assert info["command_scale"] < 0.1 or on_drum
+        assert Workspace.contains(observation + 0.02 * (MID_AIR - observation))
+        assert info["command_scale"] < 0.1
         assert np.linalg.norm(env.simulation.tip_velocity) < 0.05
         before = observation
         for _ in range(10):
@@ -316,18 +315,18 @@ def test_hostile_actions_keep_the_joints_limits(mode, hold):
 
 
 def test_pressing_on_a_head_is_gentle(env):
-    """Full speed into the head, held: the force is bounded, the stick stays as it is turned."""
-    env.reset(options={"start": [0.68, 0.14, 0.30]})
+    """Full speed into the head, held for 0.8 s: one hit, a bounded force, the stick stays put."""
+    first, _ = env.reset(options={"start": [0.62, 0.14, 0.30]})
     forces, hits = [], []
-    for _ in range(200):
-        *_, info = env.step(np.array([0.0, 0.0, -1.0]))
+    for _ in range(80):
+        observation, *_, info = env.step(np.array([0.0, 0.0, -1.0]))
         forces.append(info["forces"][1])
         hits += info["hits"]
-    assert len(hits) == 1
-    assert hits[0].drum == 1
-    assert 10 < np.median(forces[50:]) < 40
-    assert max(forces) < 100
+    assert [hit.drum for hit in hits] == [1]
+    assert 10 < np.median(forces[20:]) < 40
+    assert max(forces) < 120
     assert np.abs(env.simulation.controller.rotation_error()).max() < 0.05
+    assert np.linalg.norm((observation - first)[:2]) < 0.1  # it creeps
 
 
 def test_torque_mode_does_what_velocity_mode_does():
