@@ -15,9 +15,9 @@ to the workspace's border: near a stop or the border the allowed approach is (di
 So a command that cannot be carried out is slowed as a whole, and never bent.
 
 Acceleration. v is not the command itself but the tip's present velocity plus the change to the
-command, along it and across it shortened to `TIP_ACCELERATION` dt each. Far below what the motors could do, it is what makes
-the arm gentle: on a drum head, which stops the tip, it pushes with at most about the tip's inertia
-(1.2 kg) times that, 25 N, whatever is commanded.
+command, shortened, along the command and across it, to `TIP_ACCELERATION` dt each. Far below what
+the motors could do, it is what makes the arm gentle: on a drum head, which stops the tip, it pushes
+with at most about the tip's inertia (1.2 kg) times that, 25 N, whatever is commanded.
 
 Torques. tau = M (dq - dq_now) / dt + h brings the joints to dq within one control step, M the
 inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). Each joint's
@@ -187,7 +187,8 @@ class Controller:
         change = (velocity - data.qvel) / CONTROL_DT
         mujoco.mj_mulM(self.scene.model, data, self._moved, change)
         torque = self.going_on() + self._moved
-        return np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
+        limited: FloatArray = np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
+        return limited
 
     def going_on(self) -> FloatArray:
         """Return h, the torques that keep the joint velocities, shape (7,)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, SupportsFloat, cast
 
@@ -171,7 +171,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     size, direction)` moves the arm aside at once, so that the tip is displaced by `size` diagonals,
     or as far as arm and drums allow; joint velocities stay. A `ForcePush(fraction, impulse,
     duration, direction)` pushes the tip with a steady force; the controller resists, and 4 N s
-    in 0.1 s move the tip by two or three centimetres.
+    in 0.1 s move the tip by about 0.1 m, not quite in the direction of the force.
 
     ## Version History
     * v0: Initial version. Scores belong to a version of MuJoCo: contacts are solved slightly
@@ -329,7 +329,8 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         wanted = scaled_into_box(command / MAX_SPEED) * MAX_SPEED
         controller = self.simulation.controller
         torque: FloatArray = controller.torque(controller.joint_command(wanted).velocity)
-        return torque / TORQUE_LIMITS
+        action: FloatArray = torque / TORQUE_LIMITS
+        return action
 
     def _expect_velocity_mode(self, name: str) -> None:
         if self.control_mode != "velocity":
@@ -473,7 +474,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
             return self._tip.copy()
         data = self.simulation.data
         angle = 2 * np.pi * self._count * CONTROL_DT / cast("float", self.demonstrations.period)
-        parts = {
+        parts: dict[str, Callable[[], FloatArray]] = {
             "tip": lambda: self._tip,
             "tip_velocity": lambda: self.simulation.tip_velocity,
             "joints": lambda: np.concatenate([data.qpos, data.qvel]),
@@ -494,8 +495,8 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         low = {name: -bound for name, bound in high.items()}
         low["joints"] = np.concatenate([scene.lower - 0.1, np.full(7, -20.0)])
         low["force"] = np.zeros(n)
-        bounds = [np.concatenate([side[name] for name in self.observe]) for side in (low, high)]
-        return cast("spaces.Space[FloatArray]", spaces.Box(*bounds, dtype=np.float64))
+        least, most = (np.concatenate([end[name] for name in self.observe]) for end in (low, high))
+        return cast("spaces.Space[FloatArray]", spaces.Box(least, most, dtype=np.float64))
 
     def _checked_options(
         self, options: Mapping[str, Any] | None

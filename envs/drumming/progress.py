@@ -53,13 +53,14 @@ class Progress:
             Seconds a step.
         """
         middle = (x + x_next) * 0.5
-        distances, (nearest, _) = self._samples.query(np.stack([middle, x_next]))
+        distances, indices = self._samples.query(np.stack([middle, x_next]))
+        nearest, distance = np.atleast_1d(indices)[0], np.atleast_1d(distances)[1]
         guide = self._ahead[nearest] - middle * self._per_width
         step = x_next - x
         pace = max(float(np.sqrt(step @ step)), float(self._speeds[nearest]) * dt)
         norm = max(float(np.sqrt(guide @ guide)), 1e-12)
         reward = float(step @ guide) / (norm * pace)
-        return min(max(reward, -1.0), 1.0), float(distances[1])
+        return min(max(reward, -1.0), 1.0), float(distance)
 
     def distance(self, x: FloatArray) -> float:
         """Return the distance of a position, shape (3,), from the demonstrations in m."""

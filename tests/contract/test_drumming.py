@@ -396,7 +396,7 @@ def test_a_force_moves_the_tip_its_way_and_the_arm_comes_to_rest():
         observation, *_, info = env.step(np.zeros(3))
     assert info["pushed"]
     moved = observation - first
-    assert 0.01 < moved[1] < 0.1
+    assert 0.05 < moved[1] < 0.2
     assert np.abs(moved[[0, 2]]).max() < 0.5 * moved[1]
     assert np.linalg.norm(env.simulation.tip_velocity) < 1e-3
 
