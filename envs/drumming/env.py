@@ -604,8 +604,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         if self._renderer is None:
             from iflow_gym.envs.drumming.rendering import Renderer
 
-            self._renderer = Renderer(self.simulation.model, self.width, self.height)
-        return self._renderer.frame(self.simulation.data, self._trail)
+            self._renderer = Renderer(self.simulation.scene, self.width, self.height)
+        simulation = self.simulation
+        return self._renderer.frame(simulation.data, self._trail, simulation.peak_forces)
 
     def close(self) -> None:
         """Free what OpenGL holds."""

@@ -16,6 +16,8 @@ from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
 from iflow_gym.demonstrations import FloatArray
+from iflow_gym.envs.drumming.scene import Scene
+from iflow_gym.metrics.drumming import FORCE_THRESHOLD
 
 BACKENDS: Final = {"egl": "EGL", "osmesa": "OSMesa"}
 """Name for `MUJOCO_GL` -> library, in the order in which they are tried."""
@@ -28,6 +30,8 @@ INSTALL: Final = (
 
 TRAIL: Final = 60
 """Samples of the tip's way that a picture shows: 0.6 s."""
+STRUCK: Final = FORCE_THRESHOLD
+STRUCK_COLOUR: Final = (0.95, 0.71, 0.02)
 TRAIL_COLOUR: Final = (0.10, 0.45, 0.75)
 
 
@@ -61,14 +65,15 @@ def open_context(width: int, height: int) -> Any:
 class Renderer:
     """Draws a scene, and the tip's way, as the camera called "front" sees it."""
 
-    def __init__(self, model: Any, width: int, height: int) -> None:
+    def __init__(self, scene: Scene, width: int, height: int) -> None:
+        model = scene.model
         limits = model.vis.global_
         if not (0 < width <= limits.offwidth and 0 < height <= limits.offheight):
             raise ValueError(
                 f"Expected a picture of at most {limits.offwidth} x {limits.offheight} pixels, got "
                 f"{width} x {height}."
             )
-        self._model = model
+        self._model, self._heads = model, scene.head_geoms
         self._gl = open_context(width, height)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -83,13 +88,29 @@ class Renderer:
         # Also at the interpreter's end, where OpenGL's own order of events would print errors.
         self._free = weakref.finalize(self, _free, self._gl, self._context)
 
-    def frame(self, data: Any, trail: Sequence[FloatArray] = ()) -> NDArray[np.uint8]:
-        """Return a picture, shape (height, width, 3)."""
+    def frame(
+        self, data: Any, trail: Sequence[FloatArray] = (), forces: Sequence[float] = ()
+    ) -> NDArray[np.uint8]:
+        """Return a picture, shape (height, width, 3).
+
+        Parameters
+        ----------
+        data : mujoco.MjData
+            The state to draw.
+        trail : sequence of arrays, shape (3,)
+            Where the tip was, in m; the last `TRAIL` are drawn.
+        forces : sequence of float
+            On each head in N: one that is hit is coloured.
+        """
         self._gl.make_current()
         mujoco.mjv_updateScene(
             self._model, data, self._options, None, self._camera,
             mujoco.mjtCatBit.mjCAT_ALL.value, self._scene,
         )  # fmt: skip
+        struck = {g for g, i in self._heads.items() if i < len(forces) and forces[i] >= STRUCK}
+        for geom in self._scene.geoms[: self._scene.ngeom] if struck else ():
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in struck:
+                geom.rgba[:] = (*STRUCK_COLOUR, 1.0)
         recent = list(trail[-TRAIL:])
         for age, (begin, end) in enumerate(pairwise(recent)):
             self._add_line(begin, end, (age + 1) / len(recent))

@@ -126,7 +126,7 @@ def scene_xml(drums: Sequence[Drum]) -> str:
     _element(
         visual,
         "headlight",
-        ambient="0.45 0.45 0.45",
+        ambient="0.32 0.32 0.32",
         diffuse="0.35 0.35 0.35",
         specular="0.1 0.1 0.1",
     )
@@ -217,7 +217,7 @@ def _add_drum(world: ElementTree.Element, drum: Drum) -> None:
         body, "geom", name=f"shell:{drum.name}", type="cylinder", material="shell",
         size=[radius + 0.004, depth / 2], pos=[0, 0, -0.008 - depth / 2], contype=2, conaffinity=4,
     )  # fmt: skip
-    for height in (-0.009, -depth + 0.004):
+    for height in (-0.009, -depth - 0.004):
         _element(
             body, "geom", type="cylinder", material="metal", size=[radius + 0.007, 0.007],
             pos=[0, 0, height], contype=0, conaffinity=0,
@@ -236,10 +236,13 @@ def _add_surroundings(world: ElementTree.Element) -> None:
         world, "geom", name="floor", type="plane", size=[0, 0, 0.1], material="floor",
         contype=2, conaffinity=4,
     )  # fmt: skip
-    _element(world, "light", pos=[1.2, -0.8, 2.2], dir=[-0.5, 0.4, -1], diffuse=[0.6] * 3)
     _element(
-        world, "light", pos=[0.2, 1.5, 2.0], dir=[0.2, -0.7, -1], diffuse=[0.25] * 3,
-        castshadow="false",
+        world, "light", pos=[1.2, -0.8, 2.2], dir=[-0.5, 0.4, -1], diffuse=[0.5] * 3,
+        specular=[0.2] * 3, directional="true",
+    )  # fmt: skip
+    _element(
+        world, "light", pos=[0.2, 1.5, 2.0], dir=[0.2, -0.7, -1], diffuse=[0.15] * 3,
+        specular=[0.0] * 3, directional="true", castshadow="false",
     )  # fmt: skip
     _element(world, "camera", name="front", fovy=33, **_view(CAMERA, CAMERA_TARGET))
 
