@@ -14,6 +14,10 @@ POINT_MASS_ID = "iflow/PointMass-v0"
 """The id that takes the caller's own `demonstrations`."""
 
 
+DRUMMING_ID = "iflow/Drumming-v0"
+DRUMMING_RECORDED_ID = "iflow/DrummingRecorded-v0"
+
+
 def lasa_id(shape: str) -> str:
     """Return the id of a LASA shape."""
     return f"iflow/LASA-{shape}-v0"
@@ -33,13 +37,17 @@ def register_all() -> None:
         for letter in LETTERS:
             env_id = letter_id(letter, recorded=name == "LetterRecorded")
             _register(env_id, f"letters:{name}Env", f"letters:{name}VectorEnv", letter=letter)
+    _register(DRUMMING_ID, "drumming.env:DrummingEnv")
+    _register(DRUMMING_RECORDED_ID, "drumming.recorded:DrummingRecordedEnv")
 
 
-def _register(env_id: str, entry_point: str, vector_entry_point: str, **kwargs: object) -> None:
+def _register(
+    env_id: str, entry_point: str, vector_entry_point: str | None = None, **kwargs: object
+) -> None:
     if env_id not in gymnasium.registry:
         gymnasium.register(
             env_id,
             entry_point=f"iflow_gym.envs.{entry_point}",
-            vector_entry_point=f"iflow_gym.envs.{vector_entry_point}",
+            vector_entry_point=vector_entry_point and f"iflow_gym.envs.{vector_entry_point}",
             kwargs=kwargs,
         )
