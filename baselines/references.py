@@ -86,12 +86,12 @@ def _distances(shown: FloatArray, others: Demonstrations) -> dict[str, float]:
 
 def _orbit_distances(shown: FloatArray, dt: float, others: Demonstrations) -> dict[str, float]:
     """Return the smallest of each distance from a recording's orbit to any but its own."""
-    own = metrics.period(shown, dt)
+    own = metrics.period(shown, dt, about=others.period)
     found = [
         {
             "orbit_distance": metrics.orbit_distance(p, shown),
             "orbit_hausdorff": metrics.orbit_hausdorff(p, shown),
-            "period_error": metrics.period_error(metrics.period(p, h), own),
+            "period_error": metrics.period_error(metrics.period(p, h, about=others.period), own),
         }
         for p, h in _others(shown, others)
     ]

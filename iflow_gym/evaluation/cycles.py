@@ -82,11 +82,12 @@ def mean_period(demonstrations: Demonstrations) -> float:
     """
     assert demonstrations.period is not None
     found = [
-        metrics.period(p, dt)
+        metrics.period(p, dt, about=demonstrations.period)
         for p, dt in zip(demonstrations.positions, demonstrations.dt, strict=True)
         if len(p) * dt >= 2 * demonstrations.period
     ]
-    return float(np.mean(found)) if found and np.isfinite(found).all() else demonstrations.period
+    finite = [value for value in found if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else demonstrations.period
 
 
 def samples(period: float, dt: float) -> int:

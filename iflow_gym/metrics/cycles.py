@@ -71,7 +71,13 @@ def orbit_hausdorff(orbit: ArrayLike, demonstrations: ArrayLike) -> float:
     return np.inf if distances is None else float(max(d.max() for d in distances))
 
 
-def period(trajectory: ArrayLike, dt: float, *, size: float | None = None) -> float:
+def period(
+    trajectory: ArrayLike,
+    dt: float,
+    *,
+    size: float | None = None,
+    about: float | None = None,
+) -> float:
     r"""Period of a trajectory by its autocorrelation.
 
     With the mean taken off, the autocorrelation at lag k is normalised by the energy of both
@@ -83,7 +89,8 @@ def period(trajectory: ArrayLike, dt: float, *, size: float | None = None) -> fl
     The period is the lag of the first local maximum that reaches 0.9 of the highest one, among lags
     that leave a third of the trajectory to compare, refined by a parabola through its neighbours. A
     single first peak would take two strokes, there and back on ways close to each other, for two
-    rounds.
+    rounds. A person's rounds differ in tempo, and two rounds later a recording may be nearer to
+    itself than one round later: `about` says which peaks are meant.
 
     Parameters
     ----------
@@ -94,6 +101,8 @@ def period(trajectory: ArrayLike, dt: float, *, size: float | None = None) -> fl
     size
         Of the demonstrations, in units of length: a trajectory that deviates from its mean by less
         than a millionth of it is at rest. By default only what is exactly constant is.
+    about
+        Where given, the highest of the peaks between 2/3 and 3/2 of this period is taken, in s.
 
     Returns
     -------
@@ -123,9 +132,13 @@ def period(trajectory: ArrayLike, dt: float, *, size: float | None = None) -> fl
     both = total[n - lags] + total[n] - total[lags]
     r = 2 * products / np.where(both > 0, both, 1.0)
     peaks = 1 + np.flatnonzero((r[1:-1] > r[:-2]) & (r[1:-1] >= r[2:]) & (r[1:-1] > 0))
+    if about is not None:
+        ratio = peaks * step / positive(about, "about")
+        peaks = peaks[(ratio >= 2 / 3) & (ratio <= 3 / 2)]
     if len(peaks) == 0:
         return np.inf
-    k = int(peaks[r[peaks] >= FIRST_PEAK * r[peaks].max()][0])
+    least = 1.0 if about is not None else FIRST_PEAK
+    k = int(peaks[r[peaks] >= least * r[peaks].max()][0])
     before, here, after = r[k - 1 : k + 2]
     bend = before - 2 * here + after
     return float(k + (0.5 * (before - after) / bend if bend < 0 else 0.0)) * step

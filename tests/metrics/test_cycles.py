@@ -93,6 +93,13 @@ class TestPeriod:
         assert cycles.period(nearly[:, None] * loop, DT) == pytest.approx(PERIOD, rel=1e-2)
         assert cycles.period(twice[:, None] * loop, DT) == pytest.approx(2 * PERIOD, rel=1e-2)
 
+    def test_about_says_which_of_the_peaks_is_meant(self):
+        angle = 2 * np.pi * np.arange(6 * N) * DT / PERIOD
+        twice = 1 + 0.6 * np.cos(angle / 2)
+        loop = twice[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        assert cycles.period(loop, DT, about=1.1 * PERIOD) == pytest.approx(PERIOD, rel=2e-2)
+        assert cycles.period(loop, DT, about=0.2 * PERIOD) == np.inf
+
     def test_what_never_repeats_has_none(self):
         assert cycles.period(np.ones((100, 2)), DT) == np.inf
         assert cycles.period(np.linspace(0, 1, 100)[:, None], DT) == np.inf
