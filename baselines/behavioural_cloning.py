@@ -106,6 +106,7 @@ class BehaviouralCloning(DynamicalSystem):
     name: ClassVar[str] = "bc"
     title: ClassVar[str] = "Behavioural cloning"
     Config: ClassVar[type] = BehaviouralCloningConfig
+    learns_cycles: ClassVar[bool] = True
 
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
         (task,) = _train_all([_Task(demonstrations, rng)], self.config)
@@ -149,7 +150,7 @@ class BehaviouralCloning(DynamicalSystem):
         return Guarantee(
             "none",
             "a regression of velocities: nothing in it keeps the goal an equilibrium, attracts to "
-            "it, or says anything of states away from the demonstrations",
+            "it or to an orbit, or says anything of states away from the demonstrations",
         )
 
     def _arrays(self) -> dict[str, np.ndarray[Any, Any]]:

@@ -35,9 +35,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from iflow_gym.baselines.cycles import circular_bases, nearest_phase, phases, ridge_regression
+from iflow_gym.baselines.cycles import circular_bases, nearest_phase, ridge_regression
 from iflow_gym.baselines.starts import GivenStart
 from iflow_gym.demonstrations import Demonstrations, FloatArray
+from iflow_gym.phases import common_phases
 from iflow_gym.primitive import MovementPrimitive, PhaseState
 from iflow_gym.system import Guarantee
 
@@ -107,7 +108,7 @@ class DMP(MovementPrimitive):
         n_basis, ridge = self.config.n_basis, self.config.ridge
         if demonstrations.goal is None:
             centre = np.concatenate(demonstrations.positions).mean(axis=0)
-            aligned = phases(demonstrations, n_basis)
+            aligned = common_phases(demonstrations)
             forces = [self._forces(demonstrations, i, centre) for i in range(len(aligned))]
             features = circular_bases(np.concatenate(aligned), n_basis)
             self._adopt_cycle(ridge_regression(features, np.concatenate(forces), ridge), centre)

@@ -347,10 +347,10 @@ class GMR(DynamicalSystem):
     ----------
     priors_ : array, shape (K,)
     means_ : array, shape (K, 2 d)
-        Of offsets from the goal and velocities, in length and length/s.
+        Of offsets from the centre and velocities, in length and length/s.
     covariances_ : array, shape (K, 2 d, 2 d)
     field_ : MixtureField
-        Works on offsets from the goal.
+        Works on offsets from the centre.
 
     References
     ----------
@@ -367,25 +367,26 @@ class GMR(DynamicalSystem):
     name: ClassVar[str] = "gmr"
     title: ClassVar[str] = "GMR"
     Config: ClassVar[type] = GMRConfig
+    learns_cycles: ClassVar[bool] = True
 
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
-        goal = demonstrations.attractor
-        x = np.concatenate(demonstrations.positions) - goal
+        centre = demonstrations.centre
+        x = np.concatenate(demonstrations.positions) - centre
         v = np.concatenate(demonstrations.velocities)
-        self._adopt(*fit_mixture(x, v, self.config, rng), goal)
+        self._adopt(*fit_mixture(x, v, self.config, rng), centre)
 
     def _adopt(
-        self, priors: FloatArray, means: FloatArray, covariances: FloatArray, goal: FloatArray
+        self, priors: FloatArray, means: FloatArray, covariances: FloatArray, centre: FloatArray
     ) -> None:
         self.priors_, self.means_, self.covariances_ = priors, means, covariances
         self.field_ = MixtureField.of_joint(priors, means, covariances)
-        self._goal = goal
+        self._centre = centre
 
     def _velocity(self, x: FloatArray) -> FloatArray:
-        return self.field_.velocity(x - self._goal)
+        return self.field_.velocity(x - self._centre)
 
     def _log_prob(self, x: FloatArray, x_next: FloatArray, dt: float) -> FloatArray:
-        return self.field_.transition_log_prob(x - self._goal, x_next - self._goal, dt)
+        return self.field_.transition_log_prob(x - self._centre, x_next - self._centre, dt)
 
     @property
     def guarantee(self) -> Guarantee:
@@ -393,7 +394,7 @@ class GMR(DynamicalSystem):
         return Guarantee(
             "none",
             "a regression of velocities: nothing in it keeps the goal an equilibrium, attracts to "
-            "it, or excludes other attractors and divergence away from the demonstrations",
+            "it or to an orbit, or excludes other attractors and divergence elsewhere",
         )
 
     def _arrays(self) -> dict[str, np.ndarray[Any, Any]]:

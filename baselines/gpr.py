@@ -70,7 +70,7 @@ class GPR(DynamicalSystem):
     Attributes
     ----------
     inducing_ : array, shape (m, d)
-        Inducing positions, as offsets from the goal in length.
+        Inducing positions, as offsets from the centre in length.
     alpha_ : array, shape (m, d)
         Weights of the kernels at the inducing positions, in length/s.
     length_scales_ : array, shape (d,)
@@ -94,10 +94,11 @@ class GPR(DynamicalSystem):
     title: ClassVar[str] = "GPR"
     Config: ClassVar[type] = GPRConfig
     stochastic_fit: ClassVar[bool] = False
+    learns_cycles: ClassVar[bool] = True
 
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
-        goal = demonstrations.attractor
-        x = np.concatenate(demonstrations.positions) - goal
+        centre = demonstrations.centre
+        x = np.concatenate(demonstrations.positions) - centre
         v = np.concatenate(demonstrations.velocities)
         length, speed = np.sqrt(np.mean(x**2)), np.sqrt(np.mean(v**2))
         signal, scales, noise = maximise_likelihood(
@@ -110,7 +111,7 @@ class GPR(DynamicalSystem):
             length * scales,
             speed**2 * signal,
             speed**2 * noise,
-            goal,
+            centre,
         )
         self.alpha_ = self._weights(x, v)
 
@@ -132,11 +133,11 @@ class GPR(DynamicalSystem):
         length_scales: FloatArray,
         signal_variance: float,
         noise_variance: float,
-        goal: FloatArray,
+        centre: FloatArray,
     ) -> None:
         self.inducing_, self.alpha_, self.length_scales_ = inducing, alpha, length_scales
         self.signal_variance_, self.noise_variance_ = float(signal_variance), float(noise_variance)
-        self._goal = goal
+        self._centre = centre
         self._scaled = inducing / length_scales
         self._squares = 0.5 * (self._scaled**2).sum(axis=1)
         gram = self._kernel(inducing)
@@ -144,7 +145,7 @@ class GPR(DynamicalSystem):
         self._root = cholesky(gram, lower=True)
 
     def _kernel(self, x: FloatArray) -> FloatArray:
-        """Return k(x, Z), shape (n, m), for offsets from the goal x, shape (n, d)."""
+        """Return k(x, Z), shape (n, m), for offsets from the centre x, shape (n, d)."""
         scaled = x / self.length_scales_
         # -‖x - z‖² / 2, at most 0: rounding far away must not make a kernel above its peak.
         exponent = scaled @ self._scaled.T
@@ -156,7 +157,7 @@ class GPR(DynamicalSystem):
         return exponent
 
     def _velocity(self, x: FloatArray) -> FloatArray:
-        return self._kernel(x - self._goal) @ self.alpha_
+        return self._kernel(x - self._centre) @ self.alpha_
 
     def variance(self, x: ArrayLike) -> FloatArray:
         """Return the predictive variance of each component, shape (...), noise included.
@@ -167,7 +168,7 @@ class GPR(DynamicalSystem):
         return self._variance(states).reshape(shape[:-1])
 
     def _variance(self, x: FloatArray) -> FloatArray:
-        k = self._kernel(x - self._goal)
+        k = self._kernel(x - self._centre)
         explained = (k * cho_solve((self._root, True), k.T).T).sum(axis=1)
         return np.asarray(
             self.noise_variance_ + np.clip(self.signal_variance_ - explained, 0.0, None)

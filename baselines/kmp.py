@@ -99,6 +99,7 @@ class KMP(MovementPrimitive):
     title: ClassVar[str] = "KMP"
     Config: ClassVar[type] = KMPConfig
     stochastic_fit: ClassVar[bool] = False
+    not_learned: ClassVar[str] = "it is led through a start and a goal"
 
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
         goal = demonstrations.attractor

@@ -69,7 +69,7 @@ class LWR(DynamicalSystem):
     Attributes
     ----------
     positions_, velocities_ : arrays, shape (n, d)
-        The samples that are kept, as offsets from the goal, in length and length/s.
+        The samples that are kept, as offsets from the centre, in length and length/s.
     bandwidth_ : float
         h, in length.
 
@@ -89,10 +89,11 @@ class LWR(DynamicalSystem):
     title: ClassVar[str] = "LWR"
     Config: ClassVar[type] = LWRConfig
     stochastic_fit: ClassVar[bool] = False
+    learns_cycles: ClassVar[bool] = True
 
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
-        goal = demonstrations.attractor
-        x = [p - goal for p in demonstrations.positions]
+        centre = demonstrations.centre
+        x = [p - centre for p in demonstrations.positions]
         v = list(demonstrations.velocities)
         fraction = self.config.bandwidth
         if fraction is None:
@@ -104,18 +105,18 @@ class LWR(DynamicalSystem):
             evenly(np.concatenate(x), kept),
             evenly(np.concatenate(v), kept),
             float(fraction) * demonstrations.bounding_box.diagonal,
-            goal,
+            centre,
         )
 
     def _adopt(
-        self, positions: FloatArray, velocities: FloatArray, bandwidth: float, goal: FloatArray
+        self, positions: FloatArray, velocities: FloatArray, bandwidth: float, centre: FloatArray
     ) -> None:
         self.positions_, self.velocities_, self.bandwidth_ = positions, velocities, bandwidth
-        self._goal = goal
+        self._centre = centre
         self._local = LocalFits(positions / bandwidth, velocities, self.config.ridge)
 
     def _velocity(self, x: FloatArray) -> FloatArray:
-        return self._local((x - self._goal) / self.bandwidth_)
+        return self._local((x - self._centre) / self.bandwidth_)
 
     @property
     def guarantee(self) -> Guarantee:

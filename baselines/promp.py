@@ -35,14 +35,18 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from iflow_gym.baselines.cycles import circular_bases, nearest_phase, phases, ridge_regression
+from iflow_gym.baselines.cycles import circular_bases, nearest_phase, ridge_regression
 from iflow_gym.baselines.starts import EXACTNESS, GivenStart, minimum_jerk
 from iflow_gym.demonstrations import Demonstrations, FloatArray
+from iflow_gym.phases import common_phases
 from iflow_gym.primitive import MovementPrimitive, PhaseState, tracked
 from iflow_gym.system import Guarantee
 
 OVERLAP = 0.7
 """Value of a basis half way to its neighbour."""
+
+NEARLY = 0.05
+"""A round that lacks less than this is whole."""
 
 RIDGE = 1e-10
 """Of the regression of weights, per sample."""
@@ -255,9 +259,9 @@ def bases(phase: FloatArray, n_basis: int) -> FloatArray:
 def _rounds(demonstrations: Demonstrations, n_basis: int) -> list[tuple[FloatArray, FloatArray]]:
     """Return phases and positions of each whole round, and of recordings shorter than one."""
     found = []
-    for s, p in zip(phases(demonstrations, n_basis), demonstrations.positions, strict=True):
+    for s, p in zip(common_phases(demonstrations), demonstrations.positions, strict=True):
         done = s - s[0] + 1e-9  # so that rounding does not put a round's first sample before it
-        n_rounds = max(1, int(done[-1] + done[1]))  # n samples show n sample times
+        n_rounds = max(1, int(done[-1] + NEARLY))
         number = np.minimum(np.floor(done), n_rounds - 1)
         found += [(s[number == k], p[number == k]) for k in range(n_rounds)]
     return found

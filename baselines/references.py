@@ -12,7 +12,8 @@ import numpy as np
 
 from iflow_gym import metrics
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.evaluate import FIT_COSTS, Evaluation, Policy, evaluate, trajectory_scores
+from iflow_gym.evaluate import FIT_COSTS, Evaluation, Policy, evaluate, motion_of
+from iflow_gym.evaluation.goals import trajectory_scores
 
 
 class Reference(Protocol):
@@ -32,7 +33,8 @@ class NearestDemonstration:
     The others are the rest of the set in the reproduction protocol, and the fitted set in the
     generalisation protocol. There is no rollout, so that what compares samples of equal index from
     one start (RMSE), velocities, stability and cost do not apply. The swept area is taken to
-    demonstrations of the same length; without one it does not apply.
+    demonstrations of the same length; without one it does not apply. Of a motion that repeats the
+    distances are those between orbits, and the differences of periods.
     """
 
     name: ClassVar[str] = "nearest-demonstration"
@@ -42,14 +44,20 @@ class NearestDemonstration:
     def evaluate(self, env: Any, *, seed: int, protocol: str) -> Evaluation:
         """Score the demonstrations against each other; there is nothing random in it."""
         fitted, scored = env.unwrapped.demonstrations.split(protocol)
-        rows = [_distances(shown, fitted) for shown in scored.positions]
-        names = [m.name for m in metrics.METRICS if any(m.name in row for row in rows)]
+        motion = motion_of(scored)
+        if motion == "goal":
+            rows = [_distances(shown, fitted) for shown in scored.positions]
+        else:
+            pairs = zip(scored.positions, scored.dt, strict=True)
+            rows = [_orbit_distances(shown, dt, fitted) for shown, dt in pairs]
+        known = metrics.metrics_of(motion)
+        names = [m.name for m in known if any(m.name in row for row in rows)]
         per_demonstration = {name: [row.get(name) for row in rows] for name in names}
         present = {
             name: [value for value in values if value is not None]
             for name, values in per_demonstration.items()
         }
-        absent = {m.name: None for m in metrics.METRICS if m.name not in FIT_COSTS}
+        absent = {m.name: None for m in known if m.name not in FIT_COSTS}
         means = {name: float(np.mean(values)) for name, values in present.items()}
         medians = {name: float(np.median(values)) for name, values in present.items()}
         return Evaluation({**absent, **means}, dict(medians), per_demonstration)
@@ -57,11 +65,7 @@ class NearestDemonstration:
 
 def _distances(shown: FloatArray, others: Demonstrations) -> dict[str, float]:
     """Return the smallest of each distance from a recording to any but itself."""
-    pool = [p for p in others.positions if p is not shown]
-    if not pool:
-        raise ValueError(
-            "Expected at least two demonstrations to compare with each other, got one."
-        )
+    pool = [p for p, _ in _others(shown, others)]
     least: dict[str, float] = {}
     for length in sorted({len(p) for p in pool}):
         same = [p for p in pool if len(p) == length]
@@ -80,14 +84,39 @@ def _distances(shown: FloatArray, others: Demonstrations) -> dict[str, float]:
     return least
 
 
+def _orbit_distances(shown: FloatArray, dt: float, others: Demonstrations) -> dict[str, float]:
+    """Return the smallest of each distance from a recording's orbit to any but its own."""
+    own = metrics.period(shown, dt, about=others.period)
+    found = [
+        {
+            "orbit_distance": metrics.orbit_distance(p, shown),
+            "orbit_hausdorff": metrics.orbit_hausdorff(p, shown),
+            "period_error": metrics.period_error(metrics.period(p, h, about=others.period), own),
+        }
+        for p, h in _others(shown, others)
+    ]
+    return {name: min(row[name] for row in found) for name in found[0]}
+
+
+def _others(shown: FloatArray, others: Demonstrations) -> list[tuple[FloatArray, float]]:
+    """Return the other recordings with their sample times."""
+    pool = [(p, dt) for p, dt in zip(others.positions, others.dt, strict=True) if p is not shown]
+    if not pool:
+        raise ValueError(
+            "Expected at least two demonstrations to compare with each other, got one."
+        )
+    return pool
+
+
 class Replay:
     """Plays a recording back in real time: the scored one itself, or the nearest fitted one.
 
     From a start it takes the fitted recording whose first sample is nearest, and commands, at time
     t, the velocity that brings the mass to where the recording is at t + dt; after its end, to its
-    last sample. In the reproduction protocol that is the scored recording itself, and what is left
-    is rounding. In the generalisation protocol the mass leaps to the recording as fast as the
-    environment lets it, and stays on it.
+    last sample, or where the motion repeats, to its first one and on from there. In the
+    reproduction protocol that is the scored recording itself, and what is left is rounding. In the
+    generalisation protocol the mass leaps to the recording as fast as the environment lets it, and
+    stays on it.
 
     It depends on time and knows nothing of states off its recording, so that the metrics of the
     field and of stability do not apply.
@@ -146,7 +175,8 @@ class ReplayPolicy:
     def _at(self, index: int, time: float) -> FloatArray:
         """Return where a recording is at a time in seconds, between its samples by a line."""
         samples = self._recordings.positions[index]
-        place = min(time / self._recordings.dt[index], len(samples) - 1.0)
+        place, last = time / self._recordings.dt[index], len(samples) - 1.0
+        place = min(place, last) if self._recordings.period is None else place % last
         before = min(int(place), len(samples) - 2)
         here: FloatArray = samples[before] + (place - before) * (
             samples[before + 1] - samples[before]

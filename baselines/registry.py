@@ -29,6 +29,7 @@ METHODS = {
     "dmp": "iflow_gym.baselines.dmp:DMP",
     "promp": "iflow_gym.baselines.promp:ProMP",
     "kmp": "iflow_gym.baselines.kmp:KMP",
+    "orbit-field": "iflow_gym.baselines.orbit_field:OrbitField",
 }
 """Name to ``module:Class`` of every method, a `Method` whose `name` is the key."""
 

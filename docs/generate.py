@@ -11,19 +11,29 @@ from pathlib import Path
 import numpy as np
 
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
+from iflow_gym.datasets.letters import LETTERS
 from iflow_gym.demonstrations import PROTOCOLS
 from iflow_gym.envs.lasa import LASAEnv
+from iflow_gym.envs.letters import LetterEnv, LetterRecordedEnv
 from iflow_gym.envs.point_mass import PointMassEnv
 from iflow_gym.metrics import METRICS
-from iflow_gym.registration import POINT_MASS_ID, lasa_id
+from iflow_gym.registration import POINT_MASS_ID, lasa_id, letter_id
 from iflow_gym.results import read_results
 
 DOCS = Path(__file__).parent
+
+OF = {("goal", "cycle"): "both kinds", ("goal",): "that end", ("cycle",): "that repeat"}
+"""Kinds of motion, in words."""
 
 
 def environments() -> str:
     """Return the page of the environments."""
     ids = "\n".join(f"- `{lasa_id(shape)}`" for shape in (*SINGLE_MOTIONS, *MULTI_MODELS))
+    letters = "\n".join(
+        f"- `{letter_id(letter, recorded=recorded)}`"
+        for recorded in (False, True)
+        for letter in LETTERS
+    )
     return f"""# Environments
 
 ![A frame: stream lines of a policy, the recordings, the mass](images/environment.png)
@@ -50,6 +60,22 @@ The batched version steps all at once in NumPy and gives the bits that the singl
 ## Ids
 
 {ids}
+
+# `iflow/Letter-<Letter>-v0`
+
+{inspect.getdoc(LetterEnv)}
+
+![The suite's letters beside recorded ones](images/letters.png)
+
+[How they are made](letters.md), and how they compare with recorded ones.
+
+# `iflow/LetterRecorded-<Letter>-v0`
+
+{inspect.getdoc(LetterRecordedEnv)}
+
+## Ids
+
+{letters}
 """
 
 
@@ -58,15 +84,15 @@ def metrics() -> str:
     tables = ""
     for family in ("accuracy", "stability", "cost"):
         rows = "\n".join(
-            f"| `{m.name}` | {m.definition} | {m.unit} | {m.better} |"
+            f"| `{m.name}` | {m.definition} | {m.unit} | {m.better} | {OF[m.motions]} |"
             for m in METRICS
             if m.family == family
         )
         tables += f"""
 ## {family.capitalize()}
 
-| name | definition | unit | better |
-| --- | --- | --- | --- |
+| name | definition | unit | better | of motions |
+| --- | --- | --- | --- | --- |
 {rows}
 """
     return f"""# Metrics
@@ -85,6 +111,10 @@ its recording's start, dt and number of samples.
 box enlarged by half of each side at every end, over five times the longest recording, and from the
 recordings' starts with a push of 25 % of the box's diagonal at 40 % of the way. Converged means
 within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
+
+**Motions that repeat** are rolled out over eight periods; the last two are the steady orbit, which
+is compared with the recording's own samples. Attraction is seen from the same grid of starts: over
+the last period a rollout stays within 5 % of the diagonal of the recordings.
 
 **Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,
 direction, velocity, likelihood, Lyapunov function) is null for them, not zero. They converge

@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 
 
 class PointMassEnv(PointMassInterface, gymnasium.Env[FloatArray, FloatArray]):
-    r"""Move a point mass to the goal the way the demonstrations do.
+    r"""Move a point mass the way the demonstrations do.
 
     ## Description
-    A point mass lives in the space of a set of demonstrations, of any dimension d. A policy that
-    is worth its name follows the demonstrated motion from where it starts, ends at the goal, stays
-    there, and comes back to the motion after a push. The arithmetic is float64, and exact: playing
-    a recording's velocities gives the recording back to rounding.
+    A point mass lives in the space of a set of demonstrations, of any dimension d. A policy that is
+    worth its name follows the demonstrated motion from where it starts, and comes back to it after
+    a push. Where the motion ends, the policy ends at the goal and stays there; where it repeats
+    with a period, the policy goes round and round at its tempo. The arithmetic is float64, and
+    exact: playing a recording's velocities gives the recording back to rounding.
 
     `env.unwrapped` has `demonstrations`, `dt`, `max_speed`, the conversions
     `velocity_to_action`, `action_to_velocity`, `force_to_action`, `action_to_force` and
@@ -73,7 +74,12 @@ class PointMassEnv(PointMassInterface, gymnasium.Env[FloatArray, FloatArray]):
 
     and r = 1 where x' is within the goal's tolerance. r lies in [-1, 1]; a replay gets about 1 a
     step, standing still 0, staying at the goal 1, and undoing a step costs what the step paid. A
-    push is not charged to the step in which it comes. `iflow_gym.envs.guide` says more.
+    push is not charged to the step in which it comes. A motion that repeats has no goal, and its
+    tempo is part of it: going faster than demonstrated pays less,
+
+    $$r = \frac{\langle u, n \rangle \, s_k}{\max(\lVert u \rVert, s_k)^2}.$$
+
+    `iflow_gym.envs.guide` says more.
 
     ## Starting State
     The first sample of a demonstration drawn uniformly, plus Gaussian noise with a standard
@@ -90,7 +96,7 @@ class PointMassEnv(PointMassInterface, gymnasium.Env[FloatArray, FloatArray]):
     ## Arguments
     | argument | default | meaning |
     | --- | --- | --- |
-    | `demonstrations` | required | `iflow_gym.Demonstrations` that end at a goal |
+    | `demonstrations` | required | `iflow_gym.Demonstrations` |
     | `control_mode` | `"velocity"` | or `"force"` |
     | `horizon` | `None` | steps an episode; `None` takes the demonstration's own |
     | `start_noise` | `0.02` | standard deviation of random starts, in diagonals |
@@ -105,8 +111,10 @@ class PointMassEnv(PointMassInterface, gymnasium.Env[FloatArray, FloatArray]):
 
     | key | type | meaning |
     | --- | --- | --- |
-    | `is_success` | bool | within 2 % of the bounding box's diagonal of the goal |
-    | `distance_to_goal` | float | length |
+    | `is_success` | bool | within 2 % of the bounding box's diagonal of the goal, or the orbit |
+    | `distance_to_goal` | float | length; of a motion that ends |
+    | `distance_to_orbit` | float | length, from the nearest sample; of a motion that repeats |
+    | `phase` | float | of that sample, in rounds from 0 to 1; of a motion that repeats |
     | `time` | float | seconds since the reset |
     | `dt` | float | seconds a step in this episode |
     | `demonstration` | int | index of the demonstration, -1 for a start of the caller's choice |
@@ -180,7 +188,7 @@ class PointMassEnv(PointMassInterface, gymnasium.Env[FloatArray, FloatArray]):
             self._trail = [self._state[:2]]
             if self.render_mode == "human":
                 self.render()
-        return np.array(self._state), self._info(self.task.distance(FLOATS, self._state))
+        return np.array(self._state), self._info(self.task.measures(FLOATS, self._state))
 
     def step(
         self, action: FloatArray
@@ -193,26 +201,26 @@ class PointMassEnv(PointMassInterface, gymnasium.Env[FloatArray, FloatArray]):
         components: list[float] = values.tolist()
         if values.shape != self._action_shape or not all(map(isfinite, components)):
             self.task.reject(values, self._action_shape)
-        self._state, reward, distance = self.task.advance(
+        self._state, reward, measures = self.task.advance(
             FLOATS, self._state, components, episode.coefficients, episode.dt
         )
         self._count += 1
         if self._count == episode.push_step:
             self._state = self.task.displaced(FLOATS, self._state, episode.push)
-            distance = self.task.distance(FLOATS, self._state)
+            measures = self.task.measures(FLOATS, self._state)
         if self.render_mode is not None:
             self._trail.append(self._state[:2])
             if self.render_mode == "human":
                 self.render()
         truncated = self._count >= episode.horizon
-        return np.array(self._state), reward, False, truncated, self._info(distance)
+        return np.array(self._state), reward, False, truncated, self._info(measures)
 
-    def _info(self, distance: float) -> dict[str, Any]:
+    def _info(self, measures: tuple[float, ...]) -> dict[str, Any]:
         episode = self._episode
         assert episode is not None
         return {
-            "is_success": distance <= self.task.tolerance,
-            "distance_to_goal": distance,
+            "is_success": measures[0] <= self.task.tolerance,
+            **dict(zip(self.task.guide.measured, measures, strict=True)),
             "time": self._count * episode.dt,
             "dt": episode.dt,
             "demonstration": episode.demonstration,
@@ -251,9 +259,7 @@ class PointMassEnv(PointMassInterface, gymnasium.Env[FloatArray, FloatArray]):
             raise ValueError(f"Expected part {' or '.join(parts._fields)}, got {part!r}.")
         demos = getattr(parts, part)
         control = self.task.control
-        settings = {"mass": self.mass, "damping": self.damping} if control.blocks == 2 else {}
-        player = PointMassEnv(self.demonstrations, control_mode=control.name, **settings)  # type: ignore[arg-type]
-        player.task.guide = self.task.guide
+        player = self.like()
         rows: dict[str, list[Any]] = {key: [] for key in _DATASET_KEYS}
         for index, positions in enumerate(self.demonstrations.positions):
             if not any(positions is p for p in demos.positions):

@@ -133,7 +133,7 @@ class PointMassVectorEnv(PointMassInterface, VectorEnv[FloatArray, FloatArray, N
                 generators[i] = seeding.np_random(own)
             self._begin(i, self.task.episode(generators[i][0], indices[i], starts[i]))
         self._ready = True
-        return self._observation(), self._info(self.task.distance(ARRAYS, self._state), mask)
+        return self._observation(), self._info(self.task.measures(ARRAYS, self._state), mask)
 
     def _checked_mask(self, mask: Any) -> BoolArray:
         if mask is None:
@@ -170,7 +170,7 @@ class PointMassVectorEnv(PointMassInterface, VectorEnv[FloatArray, FloatArray, N
         if values.shape != shape or not np.isfinite(values).all():
             self.task.reject(values, shape)
         components = list(np.ascontiguousarray(values.T))
-        following, rewards, distance = self.task.advance(
+        following, rewards, measures = self.task.advance(
             ARRAYS, self._state, components, list(self._coefficients), self._dt
         )
         self._state = following
@@ -180,25 +180,25 @@ class PointMassVectorEnv(PointMassInterface, VectorEnv[FloatArray, FloatArray, N
             if now.any():
                 push = list(np.where(now, self._push, 0.0))
                 self._state = self.task.displaced(ARRAYS, following, push)
-                distance = self.task.distance(ARRAYS, self._state)
+                measures = self.task.measures(ARRAYS, self._state)
         if self._ended.any():
             begun = np.flatnonzero(self._ended).tolist()
             for i in begun:
                 self._begin(i, self.task.episode(self._seeded()[i][0], None, None))
             rewards[begun] = 0.0
-            distance = self.task.distance(ARRAYS, self._state)
+            measures = self.task.measures(ARRAYS, self._state)
         self._ended = self._count >= self._horizon
-        info = self._info(distance, np.ones(self.num_envs, dtype=np.bool_))
+        info = self._info(measures, np.ones(self.num_envs, dtype=np.bool_))
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
         return self._observation(), rewards, terminated, self._ended.copy(), info
 
     def _observation(self) -> FloatArray:
         return np.stack(self._state, axis=-1)
 
-    def _info(self, distance: FloatArray, mask: BoolArray) -> dict[str, Any]:
+    def _info(self, measures: tuple[FloatArray, ...], mask: BoolArray) -> dict[str, Any]:
         info: dict[str, NDArray[Any]] = {
-            "is_success": distance <= self.task.tolerance,
-            "distance_to_goal": distance,
+            "is_success": measures[0] <= self.task.tolerance,
+            **dict(zip(self.task.guide.measured, measures, strict=True)),
             "time": self._count * self._dt,
             "dt": self._dt.copy(),
             "demonstration": self._demonstration.copy(),

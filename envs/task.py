@@ -8,24 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal, NamedTuple, NoReturn, cast
+from typing import Any, ClassVar, Literal, NamedTuple, NoReturn, cast
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from iflow_gym.demonstrations import GOAL_TOLERANCE, Demonstrations, FloatArray
+from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.envs.dynamics import (
     Arithmetic,
     Component,
     Control,
     ForceControl,
     VelocityControl,
-    dot,
     scaled_into_box,
 )
-from iflow_gym.envs.guide import Guide, guide_for
+from iflow_gym.envs.guide import guide_for
 
 ControlMode = Literal["velocity", "force"]
 
@@ -43,9 +41,6 @@ START_NOISE = 0.02
 
 TIME_CONSTANT = 0.01
 """Default mass / damping in force mode as a fraction of the demonstrations' mean duration."""
-
-INFO_KEYS = ("is_success", "distance_to_goal", "time", "dt", "demonstration", "pushed")
-"""Keys of `info`, the same after a reset and after every step."""
 
 RESET_OPTIONS = ("demonstration", "start")
 
@@ -118,8 +113,8 @@ class PointMassTask:
         self.n_dims = demonstrations.n_dims
         box = demonstrations.bounding_box
         self.diagonal = box.diagonal
-        self.tolerance = GOAL_TOLERANCE * self.diagonal
-        self._goal: list[float] = demonstrations.attractor.tolist()
+        self.guide = guide_for(demonstrations)
+        self.tolerance = self.guide.tolerance
         half = ARENA / 2 * np.maximum(box.high - box.low, THINNEST_SIDE * self.diagonal)
         centre = (box.low + box.high) / 2
         self.low, self.high = centre - half, centre + half
@@ -165,11 +160,6 @@ class PointMassTask:
             speeds = np.full(self.n_dims, self.max_speed)
             low, high = np.concatenate([low, -speeds]), np.concatenate([high, speeds])
         return cast("spaces.Space[FloatArray]", spaces.Box(low, high, dtype=np.float64))
-
-    @cached_property
-    def guide(self) -> Guide:
-        """The reward's field, made at the first step."""
-        return guide_for(self.demonstrations)
 
     # Episodes -----------------------------------------------------------------------------
 
@@ -227,18 +217,19 @@ class PointMassTask:
         action: Sequence[Component],
         coefficients: Sequence[Component],
         dt: Component,
-    ) -> tuple[list[Component], Component, Component]:
-        """Return the state one dt later, the reward, and the distance to the goal."""
+    ) -> tuple[list[Component], Component, tuple[Component, ...]]:
+        """Return the state one dt later, the reward, and the measures there."""
         following = self.control.advance(ops, state, action, coefficients, *self._walls)
         d = self.n_dims
-        distance = self.distance(ops, following)
-        progress = self.guide.reward(ops, state[:d], following[:d], dt)
-        return following, ops.select(distance <= self.tolerance, 1.0, progress), distance
+        measures = self.guide.measures(ops, following)
+        reward = self.guide.reward(ops, state[:d], following[:d], dt, measures[0])
+        return following, reward, measures
 
-    def distance(self, ops: Arithmetic[Component], state: Sequence[Component]) -> Component:
-        """Return the distance from the goal."""
-        offset = [x - g for x, g in zip(state, self._goal, strict=False)]  # positions come first
-        return ops.root(dot(offset, offset))
+    def measures(
+        self, ops: Arithmetic[Component], state: Sequence[Component]
+    ) -> tuple[Component, ...]:
+        """Return the distance from the goal; of a motion that repeats from the orbit, and phase."""
+        return self.guide.measures(ops, state)
 
     def displaced(
         self, ops: Arithmetic[Component], state: Sequence[Component], push: Sequence[Component]
@@ -325,6 +316,33 @@ class PointMassInterface:
     """
 
     task: PointMassTask
+
+    rivals: ClassVar[tuple[str, ...]] = ()
+    """Ids of environments whose motions a model of this one's is to be told apart from by its
+    density, itself among them; none by default."""
+
+    def like(
+        self,
+        num_envs: int | None = None,
+        *,
+        horizon: int | None = None,
+        perturbation: Push | None = None,
+    ) -> Any:
+        """Return an environment of the same motion and control, or a batch of `num_envs` of them.
+
+        Its horizon and perturbation are its own; it does not render, and has no wrappers.
+        """
+        from iflow_gym.envs.point_mass import PointMassEnv
+        from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
+
+        settings: dict[str, Any] = {
+            "control_mode": self.control_mode, "horizon": horizon, "perturbation": perturbation
+        }  # fmt: skip
+        if self.control_mode == "force":
+            settings |= {"mass": self.mass, "damping": self.damping}
+        if num_envs is None:
+            return PointMassEnv(self.demonstrations, **settings)
+        return PointMassVectorEnv(self.demonstrations, num_envs, **settings)
 
     @property
     def dt(self) -> Any:

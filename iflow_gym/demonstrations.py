@@ -197,6 +197,13 @@ class Demonstrations:
             )
         return self.goal
 
+    @cached_property
+    def centre(self) -> FloatArray:
+        """The goal, shape (d,); of a motion that repeats, the mean of its samples."""
+        if self.goal is not None:
+            return self.goal
+        return _frozen(np.concatenate(self.positions).mean(axis=0))
+
     @property
     def starts(self) -> FloatArray:
         """First sample of each recording, shape (n, d)."""
@@ -262,6 +269,11 @@ class Demonstrations:
             length_unit=self.length_unit,
             source=self.source,
         )
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the splits that the set has: one recording leaves none to hold out."""
+        return PROTOCOLS if len(self) > 1 else PROTOCOLS[:1]
 
     def split(self, protocol: str = "reproduction") -> Split:
         """Return what to fit on and what to score on.

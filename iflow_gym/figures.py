@@ -348,8 +348,53 @@ class FieldPanel:
     note: str = ""
 
 
+def confusion_figure(matrices: Mapping[str, ArrayLike], labels: Sequence[str]) -> Figure:
+    """Return a confusion matrix for each method, side by side.
+
+    Parameters
+    ----------
+    matrices
+        Title of the method to counts, shape (n, n): how many of class i were taken for class j.
+    labels
+        Names of the n classes.
+    """
+    size = 0.55 * len(labels) + 0.8
+    figure = Figure(
+        figsize=(size * len(matrices) + 0.4, size + 0.5), layout="constrained", facecolor="white"
+    )
+    axes = figure.subplots(1, len(matrices), squeeze=False)[0]
+    for ax, (title, matrix) in zip(axes, matrices.items(), strict=True):
+        counts = np.asarray(matrix)
+        shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        ax.imshow(shares, cmap="Blues", vmin=0, vmax=1.25)
+        for i, j in np.ndindex(counts.shape):
+            ax.text(
+                j, i, str(counts[i, j]), ha="center", va="center", fontsize=10,
+                color="white" if shares[i, j] > 0.6 else INK if counts[i, j] else "#b5afa2",
+            )  # fmt: skip
+        right = np.trace(counts) / counts.sum()
+        ax.set_title(f"{title}: {100 * right:.1f} %", fontsize=10, color=INK)
+        ax.set_xticks(range(len(labels)), labels)
+        ax.set_yticks(range(len(labels)), labels)
+        ax.set_xlabel("taken for", color=INK)
+        ax.tick_params(colors=INK, length=0)
+        for spine in ax.spines.values():
+            spine.set_visible(False)
+    axes[0].set_ylabel("is", color=INK)
+    return figure
+
+
 def reproductions(system: Any, demonstrations: Demonstrations) -> list[FloatArray]:
-    """Return the system's own rollout from each demonstration's start, as long as it is."""
+    """Return the system's own rollout from each demonstration's start, as long as it is.
+
+    Of a motion that repeats four rollouts of three periods instead, from outside and from inside.
+    """
+    if demonstrations.period is not None:
+        low, high = demonstrations.bounding_box
+        middle, half = (low + high) / 2, (high - low) / 2
+        starts = middle + half * np.array([[1.4, 1.3], [-1.4, 1.3], [-1.4, -1.3], [1.4, -1.3]])
+        n_steps = round(3 * demonstrations.period / demonstrations.mean_dt)
+        return [system.rollout(start, n_steps, demonstrations.mean_dt) for start in starts]
     return [
         system.rollout(path[0], len(path) - 1, dt)
         for path, dt in zip(demonstrations.positions, demonstrations.dt, strict=True)

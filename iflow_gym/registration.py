@@ -8,9 +8,14 @@ from __future__ import annotations
 import gymnasium
 
 from iflow_gym.datasets.lasa import SHAPES
+from iflow_gym.datasets.letters import LETTERS
 
 POINT_MASS_ID = "iflow/PointMass-v0"
 """The id that takes the caller's own `demonstrations`."""
+
+
+DRUMMING_ID = "iflow/Drumming-v0"
+DRUMMING_RECORDED_ID = "iflow/DrummingRecorded-v0"
 
 
 def lasa_id(shape: str) -> str:
@@ -18,18 +23,31 @@ def lasa_id(shape: str) -> str:
     return f"iflow/LASA-{shape}-v0"
 
 
+def letter_id(letter: str, *, recorded: bool = False) -> str:
+    """Return the id of a letter, of the suite's own or of the recorded ones."""
+    return f"iflow/Letter{'Recorded' if recorded else ''}-{letter}-v0"
+
+
 def register_all() -> None:
     """Register every id with Gymnasium; ids that are registered already stay as they are."""
     _register(POINT_MASS_ID, "point_mass:PointMassEnv", "point_mass_vector:PointMassVectorEnv")
     for shape in SHAPES:
         _register(lasa_id(shape), "lasa:LASAEnv", "lasa:LASAVectorEnv", shape=shape)
+    for name in ("Letter", "LetterRecorded"):
+        for letter in LETTERS:
+            env_id = letter_id(letter, recorded=name == "LetterRecorded")
+            _register(env_id, f"letters:{name}Env", f"letters:{name}VectorEnv", letter=letter)
+    _register(DRUMMING_ID, "drumming.env:DrummingEnv")
+    _register(DRUMMING_RECORDED_ID, "drumming.recorded:DrummingRecordedEnv")
 
 
-def _register(env_id: str, entry_point: str, vector_entry_point: str, **kwargs: object) -> None:
+def _register(
+    env_id: str, entry_point: str, vector_entry_point: str | None = None, **kwargs: object
+) -> None:
     if env_id not in gymnasium.registry:
         gymnasium.register(
             env_id,
             entry_point=f"iflow_gym.envs.{entry_point}",
-            vector_entry_point=f"iflow_gym.envs.{vector_entry_point}",
+            vector_entry_point=vector_entry_point and f"iflow_gym.envs.{vector_entry_point}",
             kwargs=kwargs,
         )

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from iflow_gym.demonstrations import PROTOCOLS
-from iflow_gym.metrics import METRICS
+from iflow_gym.metrics import metrics_of
 from iflow_gym.system import Guarantee
 
 SCHEMA_VERSION = 1
@@ -71,12 +71,16 @@ class Result:
     uses_time: bool = False
     """Whether the method follows a clock: it has no field, and does not compete with those."""
     metrics: dict[str, float | None] = field(default_factory=dict)
-    """Every metric of `iflow_gym.metrics.METRICS` by name, where one has a value for each scored
-    demonstration their mean; None where it does not apply. Empty for a failed cell."""
+    """Every metric of the environment's kind of motion (`iflow_gym.metrics.metrics_of`) by name,
+    where one has a value for each scored demonstration their mean; None where it does not apply.
+    Empty for a failed cell."""
     medians: dict[str, float | None] = field(default_factory=dict)
     """Median over the scored demonstrations, of the metrics that have a value for each."""
     per_demonstration: dict[str, list[float | None]] = field(default_factory=dict)
     """Value for each scored demonstration, in the order of the split."""
+    likelihoods: dict[str, list[float]] = field(default_factory=dict)
+    """Log densities, nats, under this cell's model of the scored demonstrations of each motion that
+    it is to be told apart from, by environment id; empty where there are none."""
     guarantee: Guarantee | None = None
     """What the method says of its stability; None for a failed cell and for a reference."""
     target: str | None = None
@@ -128,12 +132,16 @@ class ResultFileError(ValueError):
 
 
 def check_metrics(metrics: Mapping[str, float | None]) -> None:
-    """Raise ValueError unless every metric has a number that it can have, or None.
+    """Raise ValueError unless every metric of a kind of motion has a number it can have, or None.
 
     A negative value is one that only a log-likelihood can have; nan is no value.
     """
-    if missing := sorted({metric.name for metric in METRICS} - set(metrics)):
-        raise ValueError(f"expected every metric, got none of {missing}")
+    missing = [
+        {metric.name for metric in metrics_of(motion)} - set(metrics)
+        for motion in ("goal", "cycle")
+    ]
+    if all(missing):
+        raise ValueError(f"expected every metric, got none of {sorted(missing[0])}")
     for name, value in metrics.items():
         _check_value(name, value)
 
@@ -213,7 +221,8 @@ def read_result(path: str | os.PathLike[str]) -> Result:
             f"{file} has schema version {version}, this package reads up to {SCHEMA_VERSION}: "
             "upgrade iflow-gym."
         )
-    values.setdefault("uses_time", False)  # records from before there were such methods lack it
+    # Records from before there were such methods and motions lack these.
+    values = {"uses_time": False, "likelihoods": {}, **values}
     known = {f.name for f in dataclasses.fields(Result)}
     if known != set(values):
         raise ResultFileError(
@@ -313,12 +322,18 @@ def _decoded(values: dict[str, Any]) -> Result:
     for name, entries in lists.items():
         for value in entries:
             _check_value(name, value)
+    likelihoods = {}
+    for name, entries in values["likelihoods"].items():
+        likelihoods[name] = [_number(value) for value in entries]
+        if any(value is None for value in likelihoods[name]):
+            raise ValueError(f"expected log densities of {name}, got {entries}")
     guarantee = values["guarantee"]
     return Result(
         **{
             **values,
             **numbers,
             "per_demonstration": lists,
+            "likelihoods": likelihoods,
             "guarantee": None if guarantee is None else Guarantee(**guarantee),
         }
     )

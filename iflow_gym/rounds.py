@@ -17,7 +17,7 @@ itself.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from iflow_gym.demonstrations import FloatArray
@@ -62,7 +62,7 @@ LEAST_SAMPLES = 8
 """In a round."""
 
 
-def round_starts(positions: ArrayLike, dt: float, period: float | None = None) -> np.ndarray:
+def round_starts(positions: ArrayLike, dt: float, period: float | None = None) -> NDArray[np.int64]:
     """Return the samples at which rounds begin, counted from the first sample.
 
     Parameters
@@ -87,9 +87,10 @@ def round_starts(positions: ArrayLike, dt: float, period: float | None = None) -
         never returns to where it was.
     """
     phase = phases(positions, dt, period)
-    whole = np.arange(np.floor(phase[-1] + 0.5 / len(phase)) + 1)
+    half_a_sample = 0.5 * phase[-1] / len(phase)
+    whole = np.arange(np.floor(phase[-1] + half_a_sample) + 1)
     crossings = np.interp(whole, phase, np.arange(len(phase)))
-    return np.rint(crossings).astype(np.int64)
+    return np.asarray(np.rint(crossings), dtype=np.int64)
 
 
 def period_of(positions: ArrayLike, dt: float) -> float:
@@ -203,9 +204,7 @@ def _recurrence(points: FloatArray) -> float:
         states = _states(path)
         lags = _recurrent_lags(states)
         if lags:
-            residuals = np.array([_align(*_thinned(states, lag))[1] for lag in lags])
-            # The first of those that fit about as well as any.
-            return float(lags[int(np.argmax(residuals <= residuals.min() + AS_GOOD))] * stride)
+            return float(_period_among(states, lags) * stride)
         if len(points) <= SCAN * stride:
             raise ValueError(
                 "Expected a recording that returns to where it was, in position and direction, "
@@ -213,6 +212,17 @@ def _recurrence(points: FloatArray) -> float:
                 "rounds."
             )
         stride *= 2
+
+
+def _period_among(states: FloatArray, lags: list[int]) -> int:
+    """Return the first of some lags whose rounds are about as much alike as any's."""
+    residuals: list[float] = []
+    for lag in lags:
+        residuals.append(_align(*_thinned(states, lag))[1])
+        if residuals[-1] <= AS_GOOD:  # then no other is better by more
+            break
+    good = np.array(residuals) <= min(residuals) + AS_GOOD
+    return lags[int(np.argmax(good))]
 
 
 def _recurrent_lags(states: FloatArray) -> list[int]:
@@ -237,7 +247,7 @@ def _recurrent_lags(states: FloatArray) -> list[int]:
     lags = np.flatnonzero(
         low & away & (loose <= RECURRENCE) & (np.arange(longest + 1) >= LEAST_SAMPLES)
     )
-    found = []
+    found: list[int] = []
     while len(lags) and len(found) < CANDIDATES:
         near = lags[lags <= lags[0] * (1 + SLACK)]
         found.append(int(near[np.argmin(strict[near])]))
@@ -285,8 +295,8 @@ def _closed_round(states: FloatArray, lag: float) -> FloatArray:
 
 
 def _best_path(
-    states: FloatArray, template: FloatArray, moves: np.ndarray, penalty: FloatArray
-) -> np.ndarray:
+    states: FloatArray, template: FloatArray, moves: NDArray[np.int64], penalty: FloatArray
+) -> NDArray[np.int64]:
     """Return the bins, unwrapped, of the cheapest monotone alignment with the template."""
     n = len(states)
     costs = (

@@ -86,8 +86,12 @@ class Method(ABC):
     """How the next state is found: recorded with every score."""
     uses_time: ClassVar[bool] = False
     """Whether a command depends on the time since the start, and not on the state alone."""
+    learns_goals: ClassVar[bool] = True
+    """Whether `fit` takes demonstrations that end at a goal."""
     learns_cycles: ClassVar[bool] = False
-    """Whether `fit` takes demonstrations that repeat with a period, too."""
+    """Whether `fit` takes demonstrations that repeat with a period."""
+    not_learned: ClassVar[str] = "its systems end at a goal"
+    """Why it does not learn motions of the other kind, for tables; a clause."""
 
     def __init__(self, config: Any = None, **settings: Any) -> None:
         """Store the settings: a `Config`, or its fields by name, or both (names win)."""
@@ -145,15 +149,16 @@ class Method(ABC):
                 f"{self.title} learns motions that end at a goal, got {demonstrations.name!r}, "
                 f"which repeats with a period of {demonstrations.period} s."
             )
+        if demonstrations.goal is not None and not self.learns_goals:
+            raise ValueError(
+                f"{self.title} learns motions that repeat, got {demonstrations.name!r}, which ends "
+                "at a goal: pass period=... if it repeats, or use another method."
+            )
 
     def _fitted(self, demonstrations: Demonstrations) -> Self:
         self.n_dims_ = demonstrations.n_dims
         self.period_ = demonstrations.period
-        self.goal_ = (
-            np.concatenate(demonstrations.positions).mean(axis=0)
-            if demonstrations.goal is None
-            else demonstrations.goal
-        )
+        self.goal_ = demonstrations.centre
         return self
 
     @abstractmethod
@@ -287,6 +292,17 @@ class DynamicalSystem(Method):
             raise ValueError(f"Expected x and x_next of one shape, got {shape} and {shape_next}.")
         value = self._log_prob(states, following, seconds(dt))
         return None if value is None else value.reshape(shape[:-1])
+
+    def trajectory_log_prob(self, x: ArrayLike, dt: float) -> float | None:
+        """Return log p(tau) of a trajectory x, shape (T, d), given its first state; or None.
+
+        The sum of its transitions' log densities, in nats; None for a method without a density.
+        """
+        states, shape = self._states(x)
+        if len(shape) != 2 or len(states) < 2:
+            raise ValueError(f"Expected a trajectory (T, d) of two samples or more, got {shape}.")
+        value = self._log_prob(states[:-1], states[1:], seconds(dt))
+        return None if value is None else float(value.sum())
 
     @abstractmethod
     def _velocity(self, x: FloatArray) -> FloatArray:

@@ -14,18 +14,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
-from iflow_gym.metrics import Aggregate, aggregate_scores, get_metric, mean_ranks
-from iflow_gym.registration import lasa_id
+from iflow_gym.datasets.letters import LETTERS
+from iflow_gym.metrics import (
+    Aggregate,
+    Motion,
+    aggregate_scores,
+    get_metric,
+    mean_ranks,
+    metrics_of,
+)
+from iflow_gym.registration import lasa_id, letter_id
 from iflow_gym.results import Result
 from iflow_gym.system import GUARANTEE_KINDS
 
 FAMILIES = {
     "LASA-26": tuple(lasa_id(shape) for shape in SINGLE_MOTIONS),
     "LASA-Multi": tuple(lasa_id(shape) for shape in MULTI_MODELS),
+    "Letter": tuple(letter_id(letter) for letter in LETTERS),
 }
 """Environments that a family has, run or not; other families have those that were run."""
 
-RANKED = ("rmse", "frechet", "dtw", "swept_area", "seds_error", "direction_error")
+RANKED: dict[Motion, tuple[str, ...]] = {
+    "goal": ("rmse", "frechet", "dtw", "swept_area", "seds_error", "direction_error"),
+    "cycle": (
+        "orbit_distance",
+        "orbit_hausdorff",
+        "period_error",
+        "phase_rmse",
+        "dtw",
+        "seds_error",
+        "direction_error",
+    ),
+}
 """Metrics whose ranks the mean rank is the mean of: those of the accuracy table."""
 
 
@@ -44,6 +64,8 @@ class Row:
     """All that the method was run with, on any environment of the board."""
     cells: Mapping[tuple[str, int], Result]
     """By environment and seed."""
+    motion: Motion
+    """Whether the family's motions end at a goal or repeat."""
 
     @property
     def competes(self) -> bool:
@@ -119,6 +141,8 @@ class Board:
     family: str
     protocol: str
     environments: tuple[str, ...]
+    motion: Motion
+    """Whether its motions end at a goal or repeat."""
     rows: tuple[Row, ...]
     """Competitors by mean rank, best first; then by name those that use time, the references."""
 
@@ -169,7 +193,7 @@ def ranks_of(rows: Sequence[Row]) -> dict[str, float]:
         mean_ranks(
             np.stack([row.by_environment(metric)[kept] for row in rows]), get_metric(metric).better
         )
-        for metric in RANKED
+        for metric in RANKED[rows[0].motion]
         if (scored := [row for row in rows if row.n_scored])
         and all(row.applies(metric) for row in scored)
     ]
@@ -199,18 +223,25 @@ def _board(family: str, protocol: str, results: Sequence[Result]) -> Board:
     came = sorted({result.environment for result in results})
     known = FAMILIES.get(family, ())
     environments = (*known, *(e for e in came if e not in known))
+    motion = motion_of(results)
     rows = [
-        _row(environments, [r for r in results if r.method == method])
+        _row(environments, [r for r in results if r.method == method], motion)
         for method in sorted({result.method for result in results})
     ]
     ranks = ranks_of([row for row in rows if row.competes])
     rows.sort(
         key=lambda row: (row.reference, row.uses_time, ranks.get(row.method, 0.0), row.method)
     )
-    return Board(family, protocol, environments, tuple(rows))
+    return Board(family, protocol, environments, motion, tuple(rows))
 
 
-def _row(environments: tuple[str, ...], results: Sequence[Result]) -> Row:
+def motion_of(results: Iterable[Result]) -> Motion:
+    """Return the kind of motion that records are of: their metrics tell."""
+    cyclic = {m.name for m in metrics_of("cycle")} - {m.name for m in metrics_of("goal")}
+    return "cycle" if any(cyclic <= set(result.metrics) for result in results) else "goal"
+
+
+def _row(environments: tuple[str, ...], results: Sequence[Result], motion: Motion) -> Row:
     first = results[0]
     return Row(
         method=first.method,
@@ -220,4 +251,5 @@ def _row(environments: tuple[str, ...], results: Sequence[Result]) -> Row:
         environments=environments,
         seeds=tuple(sorted({result.seed for result in results})),
         cells={(result.environment, result.seed): result for result in results},
+        motion=motion,
     )

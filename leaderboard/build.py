@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from board import Board, Row, make_boards
+from classes import confusion
 from matplotlib.figure import Figure
 from page import HEADLINE, render
 from tables import heading, shape_name
@@ -31,6 +32,7 @@ from iflow_gym.figures import (
     MethodStyle,
     Point,
     box_figure,
+    confusion_figure,
     field_sheet,
     method_styles,
     save_figure,
@@ -116,11 +118,42 @@ def demonstrations_of(environment: str) -> Demonstrations | None:
 
 
 def draw(boards: Iterable[Board], results_folder: Path) -> dict[str, tuple[Figure, str]]:
-    """Return the figures by name, each with the suffix of its file.
-
-    They are of the headline family's reproduction board; where it was not run there are none.
-    """
+    """Return the figures by name, each with the suffix of its file."""
     by_key = {(board.family, board.protocol): board for board in boards}
+    return _headline_figures(by_key, results_folder) | _cycle_figures(by_key, results_folder)
+
+
+def _cycle_figures(
+    by_key: Mapping[tuple[str, str], Board], results_folder: Path
+) -> dict[str, tuple[Figure, str]]:
+    """Return every motion by every method, and which motion is taken for which."""
+    figures: dict[str, tuple[Figure, str]] = {}
+    for (family, protocol), board in by_key.items():
+        if board.motion != "cycle":
+            continue
+        if protocol == "generalisation":
+            found = {row.title: confusion(row) for row in board.methods}
+            counts = {title: matrix for title, matrix in found.items() if matrix is not None}
+            if counts:
+                labels = [shape_name(environment) for environment in board.environments]
+                figures[f"{family}-classes"] = (confusion_figure(counts, labels), ".svg")
+            continue
+        panels = [
+            panel
+            for environment in board.environments
+            for row in board.methods
+            if (panel := panel_of(row, environment, row.title, results_folder)) is not None
+        ]
+        if any(panel.system is not None for panel in panels):
+            sheet = field_sheet(panels, n_columns=len(board.methods), size=2.2)
+            figures[f"{family}-fields"] = (sheet, ".png")
+    return figures
+
+
+def _headline_figures(
+    by_key: Mapping[tuple[str, str], Board], results_folder: Path
+) -> dict[str, tuple[Figure, str]]:
+    """Return the figures of the headline family's reproduction board; none where it has not run."""
     board = by_key.get((HEADLINE, "reproduction"))
     if board is None or not any(row.n_scored for row in board.competitors):
         return {}

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
-from board import RANKED, Board
+from board import RANKED, Board, motion_of
+from classes import confusion, fraction_right
 from tables import (
     BY_MEAN,
     Aggregates,
@@ -13,6 +14,8 @@ from tables import (
     aggregates,
     escaped,
     guarantee_of,
+    outside,
+    percent,
     rank_of,
     shape_name,
     shape_table,
@@ -21,20 +24,23 @@ from tables import (
 )
 
 from iflow_gym.baselines.registry import METHODS, REFERENCES
-from iflow_gym.metrics import METRICS, get_metric, metrics_hash
+from iflow_gym.metrics import METRICS, Motion, get_metric, metrics_hash, metrics_of
 from iflow_gym.results import Result
 
 ACCURACY = RANKED
 """Columns of the accuracy tables."""
 
-STABILITY = (
-    "converged",
-    "spurious_attractors",
-    "diverged",
-    "perturbation_recovery",
-    "lyapunov_violation",
-    "settling_time",
-)
+STABILITY: dict[Motion, tuple[str, ...]] = {
+    "goal": (
+        "converged",
+        "spurious_attractors",
+        "diverged",
+        "perturbation_recovery",
+        "lyapunov_violation",
+        "settling_time",
+    ),
+    "cycle": ("attraction", "diverged", "perturbation_recovery", "lyapunov_violation"),
+}
 """Columns of the stability table, after the guarantee."""
 
 COST = ("fit_seconds", "fit_cpu_seconds", "step_us", "n_parameters", "peak_memory_mb")
@@ -43,7 +49,10 @@ COST = ("fit_seconds", "fit_cpu_seconds", "step_us", "n_parameters", "peak_memor
 DENSITY = ("velocity_rmse", "nll_1", "nll_10")
 """Columns of the smaller table of what else is measured."""
 
-BY_SHAPE = ("frechet", "rmse", "dtw", "converged")
+BY_SHAPE: dict[Motion, tuple[str, ...]] = {
+    "goal": ("frechet", "rmse", "dtw", "converged"),
+    "cycle": ("orbit_hausdorff", "orbit_distance", "period_error", "attraction"),
+}
 """Metrics that are tabled shape by shape."""
 
 SMALL = ("frechet", "rmse", "dtw", "seds_error", "converged", "spurious_attractors")
@@ -56,12 +65,24 @@ MEMORY = (
 """What `peak_memory_mb` of a record is."""
 
 HEADLINE = "LASA-26"
-"""The family that has every table."""
+"""The family that the figures of all methods are of."""
+
+BESIDE = ("LASA-Multi",)
+"""Families that have one table, beside the headline's."""
 
 PROTOCOLS = {
-    "reproduction": "fitted on all demonstrations, rolled out from each one's start",
-    "generalisation": "fitted on demonstrations 1-4, scored on 5-7",
+    "reproduction": "fitted on all demonstrations that are shown, and scored on them",
+    "generalisation": "fitted on demonstrations 1-4 of LASA's seven and scored on 5-7; of a "
+    "letter's twenty on 1-10 and 11-20",
 }
+
+WHAT = {
+    "LASA-26": "handwriting motions, each in one way",
+    "LASA-Multi": "handwriting motions that are done in several ways",
+    "Letter": "letters that are traced round and round, limit cycles in the plane",
+    "LetterRecorded": "letters that ImitationFlow's authors recorded, limit cycles in the plane",
+}
+"""What the motions of a family are."""
 
 NOTES = {
     ("LASA-Multi", "generalisation"): "These shapes hold two or three motions, one after another, "
@@ -89,7 +110,7 @@ def footnote(board: Board, found: Aggregates) -> str:
             for row in board.rows
             if any(
                 (a := found[row.method, m.name]) is not None and a.resampled == name
-                for m in METRICS
+                for m in metrics_of(board.motion)
             )
         )
         for name in ("environments", "seeds")
@@ -154,30 +175,28 @@ def _one_line(reason: str) -> str:
 
 def warnings_about(results: Sequence[Result]) -> list[str]:
     """Return what makes the records hard to compare, one sentence each."""
-    found = []
-    current = metrics_hash()
-    hashes = {result.hashes.get("metrics", "none") for result in results if result.ok}
-    if len(hashes) > 1:
-        counts = Counter(r.hashes.get("metrics", "none") for r in results if r.ok)
-        listing = ", ".join(f"{name[:12]} ({n} cells)" for name, n in sorted(counts.items()))
-        found.append(
-            f"The records were scored by different versions of the metrics: {listing}. Their "
-            "numbers do not mean the same; run `python baselines/run_all.py` again."
-        )
-    elif hashes and hashes != {current}:
-        found.append(
-            f"The records were scored by metrics of hash {next(iter(hashes))[:12]}, this checkout "
-            f"has {current[:12]}; run `python baselines/run_all.py` again."
-        )
+    found: list[str] = []
+    for motion in ("goal", "cycle"):
+        alike = [r for r in results if r.ok and motion_of([r]) == motion]
+        current = metrics_hash(motion)
+        counts = Counter(r.hashes.get("metrics", "none") for r in alike)
+        if len(counts) > 1:
+            listing = ", ".join(f"{name[:12]} ({n} cells)" for name, n in sorted(counts.items()))
+            found.append(
+                f"The records were scored by different versions of the metrics: {listing}. Their "
+                "numbers do not mean the same; run `python baselines/run_all.py` again."
+            )
+        elif counts and set(counts) != {current}:
+            found.append(
+                f"The records were scored by metrics of hash {next(iter(counts))[:12]}, this "
+                f"checkout has {current[:12]}; run `python baselines/run_all.py` again."
+            )
     for label, what in (("core", "the suite's code"), ("data", "the data of one environment")):
-        if label == "data":
-            per = {}
-            for r in results:
-                per.setdefault(r.environment, set()).add(r.hashes.get("data"))
-            mixed = any(len(entries) > 1 for entries in per.values())
-        else:
-            mixed = len({r.hashes.get(label) for r in results if r.ok}) > 1
-        if mixed:
+        per: dict[str, set[str | None]] = {}
+        for r in results:
+            if r.ok:
+                per.setdefault(r.environment, set()).add(r.hashes.get(label))
+        if any(len(entries) > 1 for entries in per.values()):
             found.append(f"The records were made with different versions of {what}.")
     found += _mixed_rows([r for r in results if r.ok])
     for library in sorted({name for r in results for name in r.versions}):
@@ -221,6 +240,7 @@ def contradictions(board: Board) -> list[str]:
         ]
         for metric, held, says in (
             ("converged", 1.0, "not every start converged within the horizon"),
+            ("attraction", 1.0, "not every start was attracted within the horizon"),
             ("lyapunov_violation", 0.0, "its Lyapunov function does not fall everywhere"),
         ):
             better = get_metric(metric).better
@@ -277,10 +297,14 @@ def render(
     page += warning(warnings_about(results))
     page += _pictures(figures, ("accuracy-stability",))
     for board in boards:
-        full = board.family == HEADLINE
+        full = board.family not in BESIDE
         page += board_section(board, units.get(board.family, "length"), full=full)
-        if full and board.protocol == "reproduction":
+        if board.family == HEADLINE and board.protocol == "reproduction":
             page += _pictures(figures, ("boxes", "accuracy-fit-time", "methods", "fields"))
+        if board.protocol == "generalisation":
+            page += _pictures(figures, (f"{board.family}-classes",))
+        else:
+            page += _pictures(figures, (f"{board.family}-fields",))
     page += shapes_section(boards)
     page += failures(boards)
     page += about(results, boards, units)
@@ -297,6 +321,11 @@ CAPTIONS = {
     "streamlines of the learned field in blue; what uses time has none.",
     "fields": "Every shape, as learned by ImitationFlow: demonstrations in orange, rollouts from "
     "their starts in green.",
+    "Letter-fields": "Every letter by every method: demonstrations in orange, rollouts from places "
+    "around in green, streamlines of the learned field in blue; what uses time has none.",
+    "LetterRecorded-fields": "Every recorded letter by every method, as above.",
+    "Letter-classes": "Which letter the unseen demonstrations are taken for, argmax_k p(tau | k) "
+    "over the four letters' models, all seeds.",
 }
 """By name of the figure."""
 
@@ -318,7 +347,8 @@ def board_section(board: Board, length_unit: str, *, full: bool) -> list[str]:
     """Return a board's tables: all of them, or one for a family beside the headline."""
     found = aggregates(board)
     page = [f"## {board.family}: {board.protocol}", ""]
-    page += [f"{len(board.environments)} shapes, {PROTOCOLS[board.protocol]}.", ""]
+    n, what = len(board.environments), WHAT.get(board.family, "motions")
+    page += [f"{n} {what}; {PROTOCOLS[board.protocol]}.", ""]
     if note := NOTES.get((board.family, board.protocol)):
         page += [note, ""]
     page += warning(contradictions(board))
@@ -330,23 +360,45 @@ def board_section(board: Board, length_unit: str, *, full: bool) -> list[str]:
         guarantee = {**first, "Guarantee": guarantee_of}
         page += aggregate_table(board, found, SMALL, length_unit, extra=guarantee)
         return [*page, f"<sub>{_statistics(SMALL)} {footnote(board, found)}</sub>", ""]
+    accuracy, stability = ACCURACY[board.motion], STABILITY[board.motion]
     page += ["### Accuracy", "", "Interquartile mean over the shapes:", ""]
-    page += aggregate_table(board, found, ACCURACY, length_unit, statistic="iqm", extra=first)
+    page += aggregate_table(board, found, accuracy, length_unit, statistic="iqm", extra=first)
     page += ["Mean over the shapes:", ""]
-    page += aggregate_table(board, found, ACCURACY, length_unit, statistic="mean")
+    page += aggregate_table(board, found, accuracy, length_unit, statistic="mean")
+    page += classification(board)
     page += [f"<sub>{footnote(board, found)}</sub>", ""]
     page += ["### Stability", ""]
     page += aggregate_table(
-        board, found, STABILITY, length_unit, extra={"Guarantee": guarantee_of}, references=False
+        board, found, stability, length_unit, extra={"Guarantee": guarantee_of}, references=False
     )
-    page += [f"<sub>{_statistics(STABILITY)}</sub>", ""]
+    page += [f"<sub>{_statistics(stability)}</sub>", ""]
     page += ["### Velocities and densities", ""]
     page += aggregate_table(board, found, DENSITY, length_unit, references=False)
     page += [f"<sub>{_statistics(DENSITY)}</sub>", ""]
     page += ["### Cost", ""]
     page += aggregate_table(board, found, COST, length_unit, references=False)
     page += [f"<sub>{_statistics(COST)} {MEMORY} {_batches(board)}</sub>", ""]
-    return page
+    return page + not_applicable(board)
+
+
+def classification(board: Board) -> list[str]:
+    """Return how well models tell the family's motions apart; nothing where none has densities."""
+    lines = []
+    for row in board.methods:
+        counts = confusion(row)
+        if counts is not None:
+            right = [escaped(row.title), percent(fraction_right(counts)), str(int(counts.sum()))]
+            lines.append(right)
+    if not lines:
+        return []
+    page = ["Taken for what they are, argmax_k p(tau | k) over the family's models:", ""]
+    return page + table(["Method", "Classification (%)", "Trajectories"], lines)
+
+
+def not_applicable(board: Board) -> list[str]:
+    """Return which registered methods cannot learn the board's motions, and why."""
+    lines = [[escaped(title), "not applicable", escaped(why)] for title, why in outside(board)]
+    return table(["Method", "Guarantee", "Reason"], lines) if lines else []
 
 
 def _statistics(metrics: Sequence[str]) -> str:
@@ -375,7 +427,7 @@ def shapes_section(boards: Sequence[Board]) -> list[str]:
     """Return every shape's own numbers, folded."""
     page = ["## Shape by shape", ""]
     for board in boards:
-        for metric in BY_SHAPE:
+        for metric in BY_SHAPE[board.motion]:
             title = f"{board.family}, {board.protocol}: {get_metric(metric).title}"
             page += [f"<details><summary>{title}</summary>", "", *shape_table(board, metric)]
             page += ["</details>", ""]
@@ -396,7 +448,9 @@ def about(
         "- **Units**: " + "; ".join(f"{f} lengths in {u}" for f, u in units.items()) + ".",
         "- **Aggregates**: the interquartile mean is the mean of the middle half of the scores. A "
         "score of ∞ is a runaway and counts. The mean rank is taken over environments and over "
-        + ", ".join(get_metric(m).title for m in RANKED)
+        + "; of cycles over ".join(
+            ", ".join(get_metric(m).title for m in names) for names in RANKED.values()
+        )
         + ", those that apply to every competitor; a cell without scores ranks last.",
         "- **Guarantee**: *proved* by construction for every state, *verified* on a bounded region "
         "with an error bound, *sampled* where it was tried, or *none*. The methods' own "

@@ -9,15 +9,25 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from board import Board, Row
 
-from iflow_gym.metrics import METRICS, Aggregate, get_metric
+from iflow_gym.baselines.registry import METHODS, load_method
+from iflow_gym.metrics import Aggregate, get_metric, metrics_of
 from iflow_gym.metrics.aggregate import Interval
 from iflow_gym.results import short_name
 
-PERCENT = frozenset({"converged", "diverged", "perturbation_recovery", "lyapunov_violation"})
+PERCENT = frozenset(
+    {
+        "converged",
+        "diverged",
+        "perturbation_recovery",
+        "lyapunov_violation",
+        "attraction",
+        "period_error",
+    }
+)
 """Fractions that are shown in percent."""
 
 
-BY_MEAN = PERCENT | {"spurious_attractors"}
+BY_MEAN = (PERCENT - {"period_error"}) | {"spurious_attractors"}
 """Metrics of which a table shows the mean: an interquartile mean would hide the shapes that fail
 just where that is what is asked."""
 
@@ -55,7 +65,11 @@ def percent(value: float | None) -> str:
     """Return a fraction in percent; 100 and 0 are exact, never rounded to."""
     if value is None or math.isnan(value):
         return "–"
+    if math.isinf(value):
+        return "∞"
     if value in (0.0, 1.0):
+        return f"{100 * value:.0f}"
+    if value > 1:
         return f"{100 * value:.0f}"
     return f"{min(max(100 * value, 0.01), 99.99):.2f}"
 
@@ -101,7 +115,7 @@ def aggregates(board: Board) -> Aggregates:
     return {
         (row.method, metric.name): row.aggregate(metric.name)
         for row in board.rows
-        for metric in METRICS
+        for metric in metrics_of(board.motion)
     }
 
 
@@ -167,6 +181,20 @@ def aggregate_table(
         if references or not row.reference
     ]
     return table(header, lines)
+
+
+def outside(board: Board) -> list[tuple[str, str]]:
+    """Return title and reason of each registered method that cannot learn a board's motions."""
+    if board.motion == "goal":
+        asked = [(load_method(name), "learns_goals") for name in METHODS]
+    else:
+        asked = [(load_method(name), "learns_cycles") for name in METHODS]
+    here = {row.method for row in board.rows}
+    return [
+        (method.title, method.not_learned)
+        for method, attribute in asked
+        if method.name not in here and not getattr(method, attribute)
+    ]
 
 
 def named(row: Row) -> str:
@@ -248,4 +276,6 @@ def shape_table(board: Board, metric: str) -> list[str]:
 
 def shape_name(environment: str) -> str:
     """Return the name of the motion in an id."""
-    return short_name(environment).removeprefix("LASA-").rpartition("-v")[0]
+    name = short_name(environment).rpartition("-v")[0]
+    suite, _, motion = name.partition("-")
+    return motion if suite in ("LASA", "Letter", "LetterRecorded") else name

@@ -22,7 +22,7 @@ from iflow_gym.figures import (
     save_figure,
     scatter_figure,
 )
-from iflow_gym.metrics import METRICS, metrics_hash
+from iflow_gym.metrics import metrics_hash, metrics_of
 from iflow_gym.plotting import GOAL
 from iflow_gym.registration import lasa_id
 from iflow_gym.results import Result, write_result
@@ -49,7 +49,7 @@ def record(method, shape, scale=1.0, **changes):
     """Return a record whose every score is `scale` times a number that depends on the shape."""
     shapes = [*SINGLE_MOTIONS, *MULTI_MODELS]
     value = scale * (1 + shapes.index(shape) / 10)
-    metrics = {m.name: value for m in METRICS} | {"converged": min(1.0, 1 / scale)}
+    metrics = {m.name: value for m in metrics_of("goal")} | {"converged": min(1.0, 1 / scale)}
     metrics |= {"diverged": 0.0, "perturbation_recovery": 0.5, "lyapunov_violation": None}
     fields = {
         "method": method,
@@ -67,7 +67,7 @@ def record(method, shape, scale=1.0, **changes):
         "integrator": "exact",
         "dt": 0.005,
         "fit": {"batch_size": 1},
-        "hashes": {"metrics": metrics_hash(), "core": "c", "data": shape},
+        "hashes": {"metrics": metrics_hash("goal"), "core": "c", "data": shape},
         "versions": {"python": "3.12", "numpy": "2.0"},
         "hardware": {"cpu": "abacus", "cores": 2, "threads": 1, "platform": "wood"},
     }
@@ -334,7 +334,7 @@ def test_records_of_other_metrics_than_the_checkouts_are_warned_of(builder):
 def test_records_that_compare_are_not_warned_of(builder):
     other = sweep("other", 2.0, guarantee=Guarantee("none", "made up"))
     assert "WARNING" not in render(builder, sweep("good") + other)
-    hashes = {"metrics": metrics_hash(), "core": "c", "code": "of another method"}
+    hashes = {"metrics": metrics_hash("goal"), "core": "c", "code": "of another method"}
     another = [record("another", s, hashes={**hashes, "data": s}) for s in SINGLE_MOTIONS]
     assert "WARNING" not in render(builder, sweep("good") + another)
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ ROOT = Path(__file__).parents[1]
 
 SHA256 = {
     "I": "31d8ec0139de3d8caf76b42ecd5964fa04dd6da6b1234bdd5f950565403c51a3",
-    "R": "457c38120140d8086762660737a1f1c1aed0db8ba2b9cfca8326ec9f93f37411",
+    "R": "bfcee8e1832fcfbae3fc42a72ea3c5e17caf9cf9dc9b1aff6158b74fec9a3b03",
     "O": "cc698a55a2aa6902aaf8b02c511d92ab5fb286f2464c8df9aa9aeb9ddc6b089e",
     "S": "3dbfaab5222d8e7b0ba563cb7fbe5075cfac1353586b2572af113342d2dba520",
 }
@@ -106,7 +107,10 @@ def test_the_numbers_are_those_of_this_version(letter):
 
 @pytest.mark.parametrize("letter", LETTERS)
 def test_no_platform_rounds_the_other_way(letter):
-    """Platforms differ by some 1e-13: nothing that is rounded or counted is nearly as close."""
+    """Errors of one ulp in every function add up to 4e-12 mm: nothing that is rounded is as close.
+
+    The velocities are differences of rounded numbers, which IEEE arithmetic makes alike.
+    """
     made = recordings(letter)
     samples = np.concatenate([r.positions for r in made])
     to_boundary = np.abs((1000 * samples) % 1 - 0.5) / 1000
@@ -115,8 +119,6 @@ def test_no_platform_rounds_the_other_way(letter):
         last = r.phases[-1 - MARGIN] - r.phases[MARGIN] - N_ROUNDS
         assert last > 1e-9
         assert r.phases[-2 - MARGIN] - r.phases[MARGIN] - N_ROUNDS < -1e-9
-        velocity = 1000 * central_difference(np.round(r.positions, 3), DT)
-        assert np.abs(velocity % 1 - 0.5).min() > 1e-9
 
 
 @pytest.mark.parametrize("letter", LETTERS)
@@ -127,7 +129,7 @@ def test_every_recording_has_four_rounds_that_never_cross_themselves(letter):
         phase = r.phases[MARGIN:-MARGIN] - r.phases[MARGIN]
         assert phase[-2] < N_ROUNDS <= phase[-1]
         cuts = np.append(np.searchsorted(phase, np.arange(N_ROUNDS)), len(phase) - 1)
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        for a, b in pairwise(cuts):
             assert len(crossings(positions[a:b])) == 0
             assert turning(positions[a : b + 1]) == pytest.approx(1, abs=0.2)
         # Wherever a round is cut: what meets is a round apart, or nearly.

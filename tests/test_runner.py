@@ -182,7 +182,7 @@ def test_one_cell_fails_the_rest_goes_on_and_the_next_run_redoes_only_it(toys, t
     assert good.fit["batch_size"] == 1
     assert good.guarantee.kind == "proved"
     assert good.config == {"rate": 2.0}
-    assert (good.preset, good.family, good.integrator) == ("smoke", "Toy-B", "explicit Euler")
+    assert (good.preset, good.family, good.integrator) == ("smoke", "Toy", "explicit Euler")
     assert set(good.hashes) == {"data", "metrics", "code", "core", "config"}
     import toys as module
 

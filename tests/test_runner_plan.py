@@ -227,7 +227,7 @@ def test_the_core_and_the_metrics_change_every_key(make_toy, monkeypatch):
     before = keys(target)
     for name in ("core_hash", "metrics_hash"):
         with monkeypatch.context() as context:
-            context.setattr(plan, name, lambda: "another")
+            context.setattr(plan, name, lambda *of: "another")
             assert not set(keys(target).values()) & set(before.values())
     assert keys(target) == before
 
@@ -293,16 +293,37 @@ def test_others_are_a_job_each(make_cells):
 
 
 def test_how_a_cell_is_scored_is_in_the_key_and_what_is_printed_is_not(monkeypatch):
-    before = fingerprint.core_hash()
+    def hashes():
+        points = plan.entry_points("iflow/LASA-Angle-v0")
+        return {m: fingerprint.core_hash.__wrapped__(points, m) for m in ("goal", "cycle")}
+
+    before = hashes()
     source = fingerprint._source
-    for module, counts in (("scoring", True), ("work", False), ("report", False)):
-        changed = f"iflow_gym.baselines.runner.{module}"
+    both = {"goal", "cycle"}
+    for module, counts in (
+        ("baselines.runner.scoring", both),
+        ("baselines.runner.work", set()),
+        ("baselines.runner.report", set()),
+        ("evaluate", both),
+        ("evaluation.rollouts", both),
+        ("evaluation.goals", {"goal"}),
+        ("evaluation.cycles", {"cycle"}),
+        ("envs.task", both),
+        ("envs.dynamics", both),
+        ("envs.letters", set()),
+        ("envs.rendering", set()),
+        ("demonstrations", both),
+        ("policy", both),
+        ("primitive", both),
+        ("system", both),
+    ):
+        changed = f"iflow_gym.{module}"
 
         def edited(name, changed=changed):
             return source(name) + "\nEDITED = 1\n" if name == changed else source(name)
 
         monkeypatch.setattr(fingerprint, "_source", edited)
-        assert (fingerprint.core_hash() != before) == counts, module
+        assert {m for m, value in hashes().items() if value != before[m]} == counts, module
 
 
 def test_the_command_line_explains_itself_and_refuses_in_a_line(tmp_path):

@@ -7,6 +7,7 @@ Code is hashed as it runs: comments, docstrings and layout do not count. (The me
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -14,31 +15,48 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from iflow_gym.metrics import Motion
+
+ENVIRONMENTS = "iflow_gym.envs"
+"""Package of the environments."""
 
 CORE = (
     "iflow_gym.baselines.runner.scoring",
     "iflow_gym.demonstrations",
     "iflow_gym.evaluate",
+    "iflow_gym.evaluation",
+    "iflow_gym.metrics",
     "iflow_gym.policy",
     "iflow_gym.primitive",
     "iflow_gym.system",
+    ENVIRONMENTS,
 )
-"""Modules that every score depends on, beside the packages in `CORE_PACKAGES`."""
-
-CORE_PACKAGES = ("iflow_gym.envs", "iflow_gym.metrics")
+"""Modules and packages that scores depend on, which are no part of a method's code."""
 
 NOT_SCORED = (
     "iflow_gym",
     "iflow_gym.datasets",
+    "iflow_gym.envs.guide",
+    "iflow_gym.envs.nearest",
     "iflow_gym.envs.rendering",
     "iflow_gym.plotting",
     "iflow_gym.registration",
     "iflow_gym.results",
 )
-"""Modules that no score depends on: the data have a hash of their own."""
+"""Modules that no score depends on: the data have a hash of their own, rewards are not scored."""
+
+OTHER_MOTIONS: dict[Motion, tuple[str, ...]] = {
+    "goal": ("iflow_gym.evaluation.cycles",),
+    "cycle": ("iflow_gym.evaluation.goals",),
+}
+"""Modules that score motions of another kind than this one."""
+
+METRICS = "iflow_gym.metrics"
+"""Package of the metrics, whose files `metrics_hash` hashes."""
 
 CORE_LIBRARIES = ("gymnasium", "numpy", "scipy")
 """Distributions that every score depends on."""
@@ -61,23 +79,39 @@ def method_code(module: str) -> Code:
     Imports are followed wherever they stand, within functions too, but not into the core, whose
     hash is `core_hash`.
     """
-    sources = dict(_closure(module))
+    top = module.partition(".")[0]
+
+    def wanted(name: str) -> bool:
+        return name.partition(".")[0] == top and not (_within(name, CORE) or name in NOT_SCORED)
+
+    sources = dict(_closure([module], wanted))
     names = {n.partition(".")[0] for text in sources.values() for n in _imports(module, text)}
-    outside = names - set(sys.stdlib_module_names) - {module.partition(".")[0], "iflow_gym"}
+    outside = names - set(sys.stdlib_module_names) - {top, "iflow_gym"}
     providers = importlib.metadata.packages_distributions()
     libraries = {providers[name][0] for name in outside if name in providers}
     return Code(_sha256_of_sources(sources.items()), tuple(sorted(libraries)))
 
 
-def core_hash() -> str:
-    """Hash the source that every score depends on."""
-    modules = list(CORE)
-    for package in CORE_PACKAGES:
-        spec = importlib.util.find_spec(package)
-        for folder in (spec.submodule_search_locations or ()) if spec else ():
-            modules += [f"{package}.{p.stem}" for p in Path(folder).glob("*.py")]
-    sources = ((m, _source(m)) for m in modules if m not in NOT_SCORED)
-    return _sha256_of_sources((m, s) for m, s in sources if s is not None)
+@functools.cache
+def core_hash(entry_points: tuple[str, ...], motion: Motion) -> str:
+    """Hash the source that the scores of an environment depend on, whatever the method.
+
+    Parameters
+    ----------
+    entry_points
+        Modules of the environment and of its batch. What they import counts, and what evaluates
+        motions of this kind: an environment of another family, or metrics of another kind of
+        motion, can be added without a record becoming stale.
+    motion
+        Whether its demonstrations end at a goal or repeat.
+    """
+    left_out = (*NOT_SCORED, *OTHER_MOTIONS[motion])
+    roots = ("iflow_gym.baselines.runner.scoring", *entry_points)
+
+    def wanted(name: str) -> bool:
+        return _within(name, CORE) and name not in left_out and not _within(name, (METRICS,))
+
+    return _sha256_of_sources(_closure(roots, wanted))
 
 
 def sha256_of(value: Any) -> str:
@@ -119,21 +153,24 @@ def _cpu() -> str:
     return platform.processor() or platform.machine()
 
 
-def _closure(module: str) -> Iterator[tuple[str, str]]:
-    """Yield the names and sources of a module and of what it imports beside it."""
-    top = module.partition(".")[0]
-    waiting, seen = [module], {module}
+def _closure(modules: Iterable[str], wanted: Callable[[str], bool]) -> Iterator[tuple[str, str]]:
+    """Yield the names and sources of modules and of what they import that is wanted."""
+    waiting = list(modules)
+    seen = set(waiting)
     while waiting:
         name = waiting.pop()
         source = _source(name)
         if source is None:
             continue
         yield name, source
-        for imported in _imports(name, source):
-            core = imported in (*CORE, *NOT_SCORED) or imported.startswith(CORE_PACKAGES)
-            if imported.partition(".")[0] == top and imported not in seen and not core:
-                seen.add(imported)
-                waiting.append(imported)
+        new = {imported for imported in _imports(name, source) if wanted(imported)} - seen
+        seen |= new
+        waiting += sorted(new)
+
+
+def _within(name: str, packages: Iterable[str]) -> bool:
+    """Whether a name is one of these modules, or lies in one of these packages."""
+    return any(name == package or name.startswith(package + ".") for package in packages)
 
 
 def _imports(module: str, source: str) -> set[str]:

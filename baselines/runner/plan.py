@@ -34,7 +34,8 @@ from iflow_gym.baselines.runner.fingerprint import (
 from iflow_gym.baselines.runner.presets import Preset, PresetError, load_settings
 from iflow_gym.datasets.lasa import MULTI_MODELS
 from iflow_gym.demonstrations import Demonstrations
-from iflow_gym.metrics import metrics_hash
+from iflow_gym.evaluate import motion_of
+from iflow_gym.metrics import Motion, metrics_hash
 from iflow_gym.registration import POINT_MASS_ID
 from iflow_gym.results import ResultFileError, read_result, result_path, short_name
 from iflow_gym.system import Method
@@ -65,6 +66,8 @@ class Entry:
     integrator: str | None
     uses_time: bool
     """Whether it follows a clock and has no field."""
+    motions: tuple[Motion, ...]
+    """What it learns: motions that end at a goal, or that repeat, too."""
     code: str
     """Hash of the code."""
     libraries: tuple[str, ...]
@@ -155,6 +158,7 @@ def _reference(name: str) -> Entry:
         config={},
         integrator=None,
         uses_time=reference.uses_time,
+        motions=("goal", "cycle"),
         code=code.sha256,
         libraries=code.libraries,
         versions=versions(code.libraries),
@@ -186,10 +190,17 @@ def _method(name: str, preset: str) -> Entry:
         config=json.loads(json.dumps(dataclasses.asdict(config), default=str)),
         integrator=method.integrator,
         uses_time=method.uses_time,
+        motions=_motions(method),
         code=code.sha256,
         libraries=code.libraries,
         versions=versions(code.libraries),
     )
+
+
+def _motions(method: type[Method]) -> tuple[Motion, ...]:
+    goal: tuple[Motion, ...] = ("goal",) if method.learns_goals else ()
+    cycle: tuple[Motion, ...] = ("cycle",) if method.learns_cycles else ()
+    return goal + cycle
 
 
 def select_environments(patterns: Sequence[str]) -> list[str]:
@@ -210,7 +221,7 @@ def family(environment: str) -> str:
     """Return the family that an environment is aggregated in."""
     name = short_name(environment)
     if not name.startswith("LASA-"):
-        return name.rpartition("-v")[0]
+        return name.partition("-")[0]
     shape = name.removeprefix("LASA-").rpartition("-v")[0]
     return "LASA-Multi" if shape in MULTI_MODELS else "LASA-26"
 
@@ -223,12 +234,29 @@ def demonstrations_of(environment: str) -> Demonstrations:
 
 
 def make_batches(environments: Sequence[str], *, batched: bool) -> list[tuple[str, ...]]:
-    """Deal environments out into batches of at most `BATCH_SIZE`, whatever their order was."""
+    """Deal environments out into batches of at most `BATCH_SIZE`, whatever their order was.
+
+    Those of one suite, such as LASA, are together: another suite beside it changes no batch.
+    """
     if not batched:
         return [(environment,) for environment in environments]
-    n_batches = math.ceil(len(environments) / BATCH_SIZE)
-    # Like cards, so that batches differ by one cell at most.
-    return [tuple(sorted(environments)[i::n_batches]) for i in range(n_batches)]
+    suites: dict[str, list[str]] = defaultdict(list)
+    for environment in sorted(environments):
+        suites[short_name(environment).partition("-")[0]].append(environment)
+    batches = []
+    for members in suites.values():
+        n_batches = math.ceil(len(members) / BATCH_SIZE)
+        # Like cards, so that batches differ by one cell at most.
+        batches += [tuple(members[i::n_batches]) for i in range(n_batches)]
+    return batches
+
+
+@cache
+def entry_points(environment: str) -> tuple[str, ...]:
+    """Return the modules of an environment and of its batch."""
+    spec = gymnasium.spec(environment)
+    points = [spec.entry_point, spec.vector_entry_point]
+    return tuple(point.partition(":")[0] for point in points if isinstance(point, str))
 
 
 def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Preset) -> list[Cell]:
@@ -238,23 +266,28 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
     core and of the metrics, the data, the protocol, the seed, the batch that the cell is fitted
     in, and the versions of the libraries that the method or the core use. It does not hash the
     preset's name or its time limit.
+
+    Methods that do not learn motions that repeat have no cells there, and sets of one recording
+    have none under a protocol that holds some out.
     """
-    core, measures = core_hash(), metrics_hash()
     cells = []
     for entry in entries:
         seeds = preset.seeds if entry.stochastic else preset.seeds[:1]
         used = {name: entry.versions.get(name) for name in (*CORE_LIBRARIES, *entry.libraries)}
+        learned = [e for e in environments if motion_of(demonstrations_of(e)) in entry.motions]
         for protocol, seed, batch in product(
-            preset.protocols, seeds, make_batches(environments, batched=entry.batched)
+            preset.protocols, seeds, make_batches(learned, batched=entry.batched)
         ):
+            batch = tuple(e for e in batch if protocol in demonstrations_of(e).protocols)
             paths = tuple(str(result_path(entry.name, e, protocol, seed)) for e in batch)
             data = [demonstrations_of(environment).sha256 for environment in batch]
             for environment, sha256 in zip(batch, data, strict=True):
+                motion = motion_of(demonstrations_of(environment))
                 hashes = {
                     "data": sha256,
-                    "metrics": measures,
+                    "metrics": metrics_hash(motion),
                     "code": entry.code,
-                    "core": core,
+                    "core": core_hash(entry_points(environment), motion),
                     "config": sha256_of(entry.config),
                 }
                 company = [paths, data]

@@ -19,8 +19,8 @@ import psutil
 from iflow_gym.baselines.registry import load_method, load_reference
 from iflow_gym.baselines.runner.fingerprint import hardware
 from iflow_gym.baselines.runner.plan import Cell, demonstrations_of, family
-from iflow_gym.evaluate import Evaluation, evaluate
-from iflow_gym.metrics import METRICS, FitCost, measure_cost
+from iflow_gym.evaluate import Evaluation, evaluate, motion_of
+from iflow_gym.metrics import FitCost, measure_cost, metrics_of
 from iflow_gym.results import Result, check_metrics
 from iflow_gym.system import Method
 
@@ -111,7 +111,8 @@ def scored_reference(cell: Cell) -> Result:
 
 def _record(cell: Cell, found: Evaluation, *, costs: dict[str, float], **known: Any) -> Result:
     values = found.metrics | costs
-    metrics = {m.name: values.get(m.name) for m in METRICS}
+    demonstrations = demonstrations_of(cell.environment)
+    metrics = {m.name: values.get(m.name) for m in metrics_of(motion_of(demonstrations))}
     check_metrics(metrics)
     return Result(
         **_common(cell),
@@ -119,7 +120,8 @@ def _record(cell: Cell, found: Evaluation, *, costs: dict[str, float], **known: 
         metrics=metrics,
         medians=found.medians,
         per_demonstration=found.per_demonstration,
-        dt=demonstrations_of(cell.environment).mean_dt,
+        likelihoods=found.likelihoods,
+        dt=demonstrations.mean_dt,
         **known,
     )
 

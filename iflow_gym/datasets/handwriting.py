@@ -100,15 +100,8 @@ class Outline:
         self.via = via
         self.height = float(np.ptp(via[:, 1]))
         weights = _smooth_weights(via, hand.rounding * self.height)
-        curve = weights @ via
-        first, second = (_derivative(curve, order) for order in (1, 2))
-        stride = np.hypot(*first.T)
-        curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / stride**3
-        speed = power_law(curvature * self.height, hand.slow_curvature, hand.fast_curvature)
-        grid = np.arange(N_KNOTS + 1) / N_KNOTS
-        pace = CubicSpline(grid, _closed(stride / speed), bc_type="periodic")
-        phase = pace.antiderivative()(grid)
-        self._weights = CubicSpline(phase / phase[-1], _closed(weights), bc_type="periodic")
+        phase = _phases(weights @ via, self.height, hand)
+        self._weights = CubicSpline(phase, _closed(weights), bc_type="periodic")
 
     def weights(self, phase: FloatArray, order: int = 0) -> FloatArray:
         """Return how much each via point counts at phases in rounds, shape (n, J); sum to 1.
@@ -215,6 +208,21 @@ def _smooth_weights(via: FloatArray, rounding: float) -> FloatArray:
     return np.asarray(np.fft.irfft(damping[:, None] * spectrum, N_KNOTS, axis=0))
 
 
+def _phases(curve: FloatArray, height: float, hand: Hand) -> FloatArray:
+    """Return the phases at which the power law passes the points of a closed curve, and 1.
+
+    Shape (n + 1,) for a curve, shape (n, 2), that is sampled evenly enough for derivatives by
+    Fourier series.
+    """
+    first, second = (_derivative(curve, order) for order in (1, 2))
+    stride = np.hypot(*first.T)
+    curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / stride**3
+    speed = power_law(curvature * height, hand.slow_curvature, hand.fast_curvature)
+    grid = np.arange(len(curve) + 1) / len(curve)
+    time = CubicSpline(grid, _closed(stride / speed), bc_type="periodic").antiderivative()(grid)
+    return np.asarray(time / time[-1])
+
+
 def _derivative(values: FloatArray, order: int) -> FloatArray:
     """Return a derivative of values that repeat, at even steps of [0, 1), shape (n, d)."""
     n = len(values)
@@ -235,20 +243,33 @@ def _uniform(bits: np.random.PCG64, shape: tuple[int, ...]) -> FloatArray:
 
 def _wander(noise: FloatArray, lag: float) -> FloatArray:
     """Pass noise through three lags of so many samples, scaled to variance 1."""
-    keep = np.exp(-1 / lag)
-    poles = np.array([1.0, -3 * keep, 3 * keep**2, -(keep**3)])
-    return _unit_variance(np.array([1.0]), poles, noise)
+    poles = np.array([1.0, -np.exp(-1 / lag)])
+
+    def lagged(samples: FloatArray) -> FloatArray:
+        for _ in range(3):  # one after another: their product is ill-conditioned
+            samples = lfilter([1.0], poles, samples, axis=-1)
+        return samples
+
+    return lagged(noise) / _size(lagged(_impulse(noise)))
 
 
 def _band(noise: FloatArray, frequency: float, width: float) -> FloatArray:
     """Pass noise through a resonance, both in cycles a sample, scaled to variance 1."""
     radius = np.exp(-np.pi * width)
     poles = [1.0, -2 * radius * np.cos(2 * np.pi * frequency), radius**2]
-    return _unit_variance(np.array([1.0, 0.0, -1.0]), np.array(poles), noise)
+
+    def resonant(samples: FloatArray) -> FloatArray:
+        return np.asarray(lfilter([1.0, 0.0, -1.0], poles, samples, axis=-1))
+
+    return resonant(noise) / _size(resonant(_impulse(noise)))
 
 
-def _unit_variance(zeros: FloatArray, poles: FloatArray, noise: FloatArray) -> FloatArray:
+def _impulse(noise: FloatArray) -> FloatArray:
     impulse = np.zeros(noise.shape[-1])
     impulse[0] = 1.0
-    gain = np.sqrt(np.sum(lfilter(zeros, poles, impulse) ** 2))
-    return np.asarray(lfilter(zeros, poles, noise, axis=-1) / gain)
+    return impulse
+
+
+def _size(response: FloatArray) -> float:
+    """Return the deviation that noise of variance 1 has after a filter, by its response."""
+    return float(np.sqrt(np.sum(response**2)))

@@ -1,8 +1,8 @@
 """The suite's numbers: pure functions over NumPy arrays, and the table of what they mean.
 
 Accuracy compares a reproduction with its demonstration, stability judges rollouts from many starts,
-cost measures a machine at work, and aggregates make one row of many cells. Nothing here knows of
-methods or environments.
+cycles compare orbits and tempos, cost measures a machine at work, and aggregates make one row of
+many cells. Nothing here knows of methods or environments.
 """
 
 from iflow_gym.metrics.accuracy import (
@@ -25,7 +25,22 @@ from iflow_gym.metrics.aggregate import (
     stratified_bootstrap,
 )
 from iflow_gym.metrics.cost import FitCost, measure_cost, median_call_us
-from iflow_gym.metrics.registry import METRICS, Metric, get_metric, metrics_hash
+from iflow_gym.metrics.cycles import (
+    attracted,
+    orbit_distance,
+    orbit_hausdorff,
+    period,
+    period_error,
+    phase_rmse,
+)
+from iflow_gym.metrics.registry import (
+    METRICS,
+    Metric,
+    Motion,
+    get_metric,
+    metrics_hash,
+    metrics_of,
+)
 from iflow_gym.metrics.stability import (
     HORIZON,
     box_diagonal,
@@ -48,7 +63,9 @@ __all__ = [
     "Bootstrap",
     "FitCost",
     "Metric",
+    "Motion",
     "aggregate_scores",
+    "attracted",
     "box_diagonal",
     "converged",
     "convergence_tolerance",
@@ -65,7 +82,13 @@ __all__ = [
     "measure_cost",
     "median_call_us",
     "metrics_hash",
+    "metrics_of",
     "nll",
+    "orbit_distance",
+    "orbit_hausdorff",
+    "period",
+    "period_error",
+    "phase_rmse",
     "rmse",
     "seds_error",
     "settling_time",

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Literal
 
+Motion = Literal["goal", "cycle"]
+"""Whether demonstrations end at a goal or repeat with a period."""
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -26,6 +29,8 @@ class Metric:
     """Heading in tables."""
     definition: str
     """What it is, in a sentence; the docstrings have the equations."""
+    motions: tuple[Motion, ...] = ("goal", "cycle")
+    """Motions that it is a number of: those that end at a goal, those that repeat, or both."""
 
 
 METRICS: tuple[Metric, ...] = (
@@ -36,6 +41,7 @@ METRICS: tuple[Metric, ...] = (
         "accuracy",
         "RMSE",
         "Root of the mean squared distance between samples of equal index.",
+        motions=("goal",),
     ),
     Metric(
         "frechet",
@@ -44,6 +50,7 @@ METRICS: tuple[Metric, ...] = (
         "accuracy",
         "Fréchet",
         "Discrete Fréchet distance on the full sequences, Euclidean.",
+        motions=("goal",),
     ),
     Metric(
         "dtw",
@@ -52,7 +59,8 @@ METRICS: tuple[Metric, ...] = (
         "accuracy",
         "DTW / sample",
         "Least sum of Euclidean distances over warping paths with steps (1,0), (0,1) and (1,1), "
-        "without a window, divided by the demonstration's number of samples.",
+        "without a window, divided by the demonstration's number of samples; of a motion that "
+        "repeats over its first period.",
     ),
     Metric(
         "swept_area",
@@ -62,6 +70,7 @@ METRICS: tuple[Metric, ...] = (
         "Swept area",
         "Sum over the steps of the exact, unsigned area of the tetragon between demonstration and "
         "reproduction; 2-D only.",
+        motions=("goal",),
     ),
     Metric(
         "swept_surface",
@@ -71,6 +80,7 @@ METRICS: tuple[Metric, ...] = (
         "Swept surface",
         "Sum over the steps of the surface of the tetragon between demonstration and reproduction, "
         "as the smaller of its two pairs of triangles; 3-D only.",
+        motions=("goal",),
     ),
     Metric(
         "seds_error",
@@ -118,6 +128,46 @@ METRICS: tuple[Metric, ...] = (
         "for methods without a density, and in reproduction, where nothing is held out.",
     ),
     Metric(
+        "orbit_distance",
+        "length",
+        "lower",
+        "accuracy",
+        "Orbit distance",
+        "Mean distance to the nearest sample between the steady orbit, the rollout's last two of "
+        "eight periods, and the demonstration's samples, both ways, averaged.",
+        motions=("cycle",),
+    ),
+    Metric(
+        "orbit_hausdorff",
+        "length",
+        "lower",
+        "accuracy",
+        "Orbit Hausdorff",
+        "Hausdorff distance between the steady orbit and the demonstration's samples: half of how "
+        "far its own rounds lie apart is the least there is.",
+        motions=("cycle",),
+    ),
+    Metric(
+        "period_error",
+        "-",
+        "lower",
+        "accuracy",
+        "Period error",
+        "Relative error of the period, by autocorrelation, against the mean of the "
+        "demonstrations'.",
+        motions=("cycle",),
+    ),
+    Metric(
+        "phase_rmse",
+        "length",
+        "lower",
+        "accuracy",
+        "Phase RMSE",
+        "RMSE between the demonstration's rounds and the steady orbit, each round at its best "
+        "shift in time.",
+        motions=("cycle",),
+    ),
+    Metric(
         "converged",
         "-",
         "higher",
@@ -125,6 +175,7 @@ METRICS: tuple[Metric, ...] = (
         "Converged",
         "Fraction of the starts that are within 2 % of the diagonal of the goal for the whole last "
         "5 % of the horizon.",
+        motions=("goal",),
     ),
     Metric(
         "settling_time",
@@ -134,6 +185,7 @@ METRICS: tuple[Metric, ...] = (
         "Settling time",
         "Median time to enter the tolerance for good, divided by the mean duration of the "
         "demonstrations; a start that does not settle takes infinitely long.",
+        motions=("goal",),
     ),
     Metric(
         "spurious_attractors",
@@ -142,6 +194,17 @@ METRICS: tuple[Metric, ...] = (
         "stability",
         "Spurious attractors",
         "Clusters of end states outside the tolerance that have stopped moving.",
+        motions=("goal",),
+    ),
+    Metric(
+        "attraction",
+        "-",
+        "higher",
+        "stability",
+        "Attraction",
+        "Fraction of the starts whose distance to the demonstrations' samples stays within 5 % of "
+        "the diagonal over the last of eight periods.",
+        motions=("cycle",),
     ),
     Metric(
         "diverged",
@@ -158,7 +221,7 @@ METRICS: tuple[Metric, ...] = (
         "stability",
         "Perturbation recovery",
         "Fraction of rollouts, pushed once at 40 % of the way by 25 % of the diagonal in a seeded "
-        "random direction, that still converge.",
+        "random direction, that still converge, or are attracted.",
     ),
     Metric(
         "lyapunov_violation",
@@ -211,8 +274,30 @@ METRICS: tuple[Metric, ...] = (
         "a batch of fits took together is shared.",
     ),
 )
-"""All metrics of point-to-point motions that are numbers, in the order of their tables. A method's
-guarantee is a word, `iflow_gym.system.Guarantee`."""
+"""All metrics that are numbers, in the order of their tables. A method's guarantee is a word,
+`iflow_gym.system.Guarantee`."""
+
+FILES: dict[Motion, tuple[str, ...]] = {
+    "goal": ("_validation.py", "accuracy.py", "cost.py", "stability.py"),
+    "cycle": ("_validation.py", "accuracy.py", "cost.py", "cycles.py", "stability.py"),
+}
+"""Files of this package that compute the metrics of a motion."""
+
+
+def metrics_of(motion: Motion) -> tuple[Metric, ...]:
+    """Metrics that are numbers of a motion.
+
+    Parameters
+    ----------
+    motion
+        "goal" or "cycle".
+
+    Returns
+    -------
+    tuple of Metric
+        In the order of their tables.
+    """
+    return tuple(metric for metric in METRICS if motion in metric.motions)
 
 
 def get_metric(name: str) -> Metric:
@@ -241,19 +326,19 @@ def get_metric(name: str) -> Metric:
 
 
 @functools.cache
-def metrics_hash() -> str:
-    """Fingerprint of the code that computes the metrics, for result records.
+def metrics_hash(motion: Motion) -> str:
+    """Fingerprint of the code that computes the metrics of a motion, for result records.
 
     Returns
     -------
     str
-        SHA-256, in hexadecimal, over the names and the text of this package's source files, sorted
-        by name, with line feeds as line endings. Two records with the same hash mean the same by
-        every number; comments and docstrings, which are the definitions, count too.
+        SHA-256, in hexadecimal, over the names and the text of the `FILES`, with line feeds as line
+        endings. Two records with the same hash mean the same by every number; comments and
+        docstrings, which are the definitions, count too.
     """
     digest = hashlib.sha256()
-    files = (f for f in resources.files(__package__).iterdir() if f.name.endswith(".py"))
-    for file in sorted(files, key=lambda f: f.name):
-        text = file.read_bytes().replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-        digest.update(file.name.encode() + b"\0" + text + b"\0")
+    folder = resources.files(__package__)
+    for name in FILES[motion]:
+        text = (folder / name).read_bytes().replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+        digest.update(name.encode() + b"\0" + text + b"\0")
     return digest.hexdigest()

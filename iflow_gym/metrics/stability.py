@@ -366,7 +366,9 @@ def uniform_states(
     return rng.uniform(lower, upper, size=(n, lower.size))
 
 
-def lyapunov_violation(derivatives: ArrayLike, states: ArrayLike, goal: ArrayLike) -> float:
+def lyapunov_violation(
+    derivatives: ArrayLike, states: ArrayLike, goal: ArrayLike | None = None
+) -> float:
     r"""Fraction of states where the Lyapunov function does not decrease.
 
     .. math:: \frac{1}{n} \#\{ i : \dot V(x_i) = \nabla V(x_i)^\top f(x_i) \ge 0 \}
@@ -379,7 +381,7 @@ def lyapunov_violation(derivatives: ArrayLike, states: ArrayLike, goal: ArrayLik
         States x_i, shape (n, d), in units of length; ``uniform_states`` draws the suite's.
     goal
         x*, shape (d,). dV/dt is zero there by definition, so that a state that is exactly x* is
-        left out, of the numerator and of n.
+        left out, of the numerator and of n. None for a motion that repeats.
 
     Returns
     -------
@@ -398,6 +400,8 @@ def lyapunov_violation(derivatives: ArrayLike, states: ArrayLike, goal: ArrayLik
             f"Expected derivatives of shape (n,) at states of shape (n, d), got {slopes.shape} "
             f"and {points.shape}"
         )
+    if goal is None:
+        return fraction(~(slopes < 0))
     elsewhere = (points != as_point(goal, points.shape[1], "goal")).any(axis=1)
     if not elsewhere.any():
         raise ValueError(f"Expected states other than the goal, got {len(points)} at the goal")

@@ -250,5 +250,5 @@ def test_a_cycle_comes_back_from_its_file(name, tmp_path):
 def test_a_period_in_another_unit_is_told(name):
     shown = ring()
     wrong = Demonstrations.from_arrays(list(shown.positions), dt=0.02, period=0.0015)
-    with pytest.raises(ValueError, match="at least 4 samples a period"):
+    with pytest.raises(ValueError, match="at least 8 samples a period"):
         load_method(name)().fit(wrong, seed=0)

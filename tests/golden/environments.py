@@ -21,8 +21,9 @@ import numpy as np
 
 import iflow_gym
 from iflow_gym.datasets.lasa import SHAPES
+from iflow_gym.datasets.letters import LETTERS
 from iflow_gym.envs.task import Push
-from iflow_gym.registration import POINT_MASS_ID, lasa_id
+from iflow_gym.registration import POINT_MASS_ID, lasa_id, letter_id
 
 PATH = Path(__file__).with_suffix(".json")
 STEPS = 300
@@ -45,7 +46,7 @@ def arguments(env_id: str) -> dict[str, object]:
     return {"demonstrations": own_demonstrations()} if env_id == POINT_MASS_ID else {}
 
 
-IDS = [POINT_MASS_ID, *map(lasa_id, SHAPES)]
+IDS = [POINT_MASS_ID, *map(lasa_id, SHAPES), *map(letter_id, LETTERS)]
 
 
 def rollout_hash(env_id: str) -> str:
@@ -56,11 +57,12 @@ def rollout_hash(env_id: str) -> str:
         env = gymnasium.make(env_id, control_mode=mode, perturbation=push, **arguments(env_id))
         rng = np.random.default_rng(1)
         observation, info = env.reset(seed=7)
-        rows = [[*observation, 0.0, info["distance_to_goal"]]]
+        measured = env.unwrapped.task.guide.measured
+        rows = [[*observation, 0.0, *(info[key] for key in measured)]]
         for _ in range(STEPS):
             action = 1.5 * rng.uniform(-1, 1, env.unwrapped.n_dims) ** 3
             observation, reward, _, truncated, info = env.step(action)
-            rows.append([*observation, reward, info["distance_to_goal"]])
+            rows.append([*observation, reward, *(info[key] for key in measured)])
             if truncated:
                 observation, _ = env.reset()
         digest.update((np.round(np.array(rows), 6) + 0.0).astype("<f8").tobytes())

@@ -17,6 +17,7 @@ MEASURED_ELSEWHERE = {
     "nll_1": "nll",
     "nll_10": "nll",
     "perturbation_recovery": "converged",
+    "attraction": "attracted",
     "fit_seconds": "measure_cost",
     "fit_cpu_seconds": "measure_cost",
     "peak_memory_mb": "measure_cost",
@@ -44,7 +45,7 @@ def test_families_stay_together():
 
 def test_higher_is_better_only_for_what_is_a_success():
     higher = {metric.name for metric in metrics.METRICS if metric.better == "higher"}
-    assert higher == {"converged", "perturbation_recovery"}
+    assert higher == {"converged", "attraction", "perturbation_recovery"}
 
 
 def test_every_metric_has_a_function():
@@ -78,12 +79,13 @@ class TestHash:
     def package(self, tmp_path, monkeypatch):
         """Let the hash read files of our own instead."""
         monkeypatch.setattr(registry.resources, "files", lambda _: tmp_path)
+        monkeypatch.setattr(registry, "FILES", {"goal": ("a.py", "b.py"), "cycle": ("b.py",)})
         (tmp_path / "b.py").write_bytes(b"two = 2\n")
         (tmp_path / "a.py").write_bytes(b"one = 1\nmore = 1\n")
         return tmp_path
 
-    def hash(self):
-        return registry.metrics_hash.__wrapped__()
+    def hash(self, motion="goal"):
+        return registry.metrics_hash.__wrapped__(motion)
 
     def test_value(self, package):
         text = b"a.py\0one = 1\nmore = 1\n\0" + b"b.py\0two = 2\n\0"
@@ -96,20 +98,25 @@ class TestHash:
         (package / "notes.txt").write_text("nothing")
         assert self.hash() == before
 
-    @pytest.mark.parametrize("change", ["text", "name", "new"])
-    def test_source_matters(self, package, change):
-        before = self.hash()
-        if change == "text":
-            (package / "a.py").write_bytes(b"one = 2\nmore = 1\n")
-        elif change == "name":
-            (package / "a.py").rename(package / "c.py")
-        else:
-            (package / "c.py").write_bytes(b"")
-        assert self.hash() != before
+    def test_source_matters_where_it_is_used(self, package):
+        goal, cycle = self.hash("goal"), self.hash("cycle")
+        (package / "a.py").write_bytes(b"one = 2\nmore = 1\n")
+        assert self.hash("goal") != goal
+        assert self.hash("cycle") == cycle
 
-    def test_of_the_package(self):
-        assert self.hash() == metrics.metrics_hash()
-        assert len(metrics.metrics_hash()) == 64
+    @pytest.mark.parametrize("motion", ["goal", "cycle"])
+    def test_of_the_package(self, motion):
+        assert self.hash(motion) == metrics.metrics_hash(motion)
+        assert len(metrics.metrics_hash(motion)) == 64
+
+    @pytest.mark.parametrize("motion", ["goal", "cycle"])
+    def test_every_file_that_computes_a_motions_metrics_is_hashed(self, motion):
+        files = pathlib.Path(metrics.__file__).parent
+        assert all((files / name).is_file() for name in registry.FILES[motion])
+        for metric in metrics.metrics_of(motion):
+            function = getattr(metrics, metric.name, None)
+            if function is not None and inspect.isfunction(function):
+                assert pathlib.Path(inspect.getfile(function)).name in registry.FILES[motion]
 
 
 def test_metrics_know_of_no_methods_environments_or_torch():

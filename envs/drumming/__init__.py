@@ -1,0 +1,1 @@
+"""Drumming with a robot arm: `iflow/Drumming-v0` and `iflow/DrummingRecorded-v0`."""

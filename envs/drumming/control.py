@@ -1,0 +1,228 @@
+r"""The task-space controller: from a velocity of the stick's tip to torques of the joints.
+
+With the Jacobian J of tip position and orientation, shape (6, 7), the tip's command v, the rotation
+vector e that turns the stick back to its fixed orientation, and the posture q_0,
+
+    dq = dq_0 + J^T (J J^T + lambda^2 I)^-1 ([v, k e] - J dq_0),     dq_0 = k_0 (q_0 - q):
+
+damped least squares with the posture in the null space (Siciliano et al., *Robotics*, 2009,
+eqs. 3.54 and 3.59; the damping grows towards a singularity as in Nakamura & Hanafusa 1986:
+lambda = lambda_0 (1 - w / w_0) where the manipulability w = sqrt(det J J^T) is below w_0, else 0).
+
+Limits. dq = a + s b, b the part that v commands and a the rest. s in [0, 1] is the largest number
+with which every joint keeps its speed limit and its distance to its stops, and the tip its distance
+to the workspace's border: near a stop or the border the allowed approach is (distance) / 0.1 s.
+So a command that cannot be carried out is slowed as a whole, and never bent.
+
+Acceleration. v is not the command itself but the tip's present velocity plus the change to the
+command, shortened, along the command and across it, to `TIP_ACCELERATION` dt each. Far below what
+the motors could do, it is what makes the arm gentle: on a drum head, which stops the tip, it pushes
+with at most about the tip's inertia (1.2 kg) times that, 25 N, whatever is commanded.
+
+Torques. tau = M (dq - dq_now) / dt + h brings the joints to dq within one control step, M the
+inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). Each joint's
+torque is cut at its motor's limit; commands in free space stay well below.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+
+from iflow_gym.demonstrations import FloatArray
+from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, Scene
+
+CONTROL_DT: Final = 0.01
+"""Seconds a control step."""
+
+POSTURE: Final = np.array([0.0, -0.72, 0.0, -2.4, 0.0, 0.47, 0.0])
+"""q_0 in rad: elbow up, the arm in its plane of symmetry."""
+
+TIP_ACCELERATION: Final = 20.0
+"""Greatest acceleration of the tip that a command brings about, in m/s^2."""
+
+ORIENTATION_GAIN: Final = 15.0
+"""k in 1/s."""
+POSTURE_GAIN: Final = 1.0
+"""k_0 in 1/s."""
+DAMPING: Final = 0.1
+"""lambda_0."""
+MANIPULABILITY: Final = 0.02
+"""w_0; between the drums w is 0.1."""
+BRAKING_TIME: Final = 0.1
+"""A joint or the tip may approach its limit at the distance to it over this many seconds."""
+JOINT_MARGIN: Final = 0.02
+"""Rad that the controller stays away from a joint's stop."""
+
+
+class JointCommand(NamedTuple):
+    """What the controller asks of the joints."""
+
+    velocity: FloatArray
+    """rad/s, shape (7,)."""
+    scale: float
+    """s in [0, 1]: how much of the command is carried out."""
+
+
+class Workspace:
+    """Where the tip may be: a box, within reach of the arm.
+
+    Reach is a ball for the wrist, which stands at a fixed offset from the tip since the
+    orientation is fixed.
+    """
+
+    low: Final = np.array([0.58, -0.40, 0.13])
+    high: Final = np.array([0.88, 0.40, 0.70])
+    centre: Final = np.array([0.36, 0.0, -0.03])
+    """Of the ball, in the tip's coordinates: the shoulder less the wrist's offset."""
+    radius: Final = 0.77
+
+    @classmethod
+    def contains(cls, points: FloatArray) -> Any:
+        """Which points, shape (..., 3), are inside; shape (...)."""
+        inside = ((points >= cls.low) & (points <= cls.high)).all(axis=-1)
+        near = np.linalg.norm(points - cls.centre, axis=-1) <= cls.radius
+        return inside & near
+
+    @classmethod
+    def scale(cls, point: FloatArray, velocity: FloatArray) -> float:
+        """Return how much of a velocity is allowed at a point."""
+        worst = 1.0
+        for x, v, low, high in zip(point.tolist(), velocity.tolist(), _LOW, _HIGH, strict=True):
+            outward = v * BRAKING_TIME
+            if outward > high - x and v > 0:
+                worst = min(worst, max(high - x, 0.0) / outward)
+            elif outward < low - x and v < 0:
+                worst = min(worst, min(low - x, 0.0) / outward)
+        arm = point - cls.centre
+        length = float(np.sqrt(arm @ arm))
+        outward = float(arm @ velocity) / length * BRAKING_TIME
+        gap = cls.radius - length
+        if outward > gap and outward > 0:
+            worst = min(worst, max(gap, 0.0) / outward)
+        return worst
+
+
+_LOW: Final = Workspace.low.tolist()
+_HIGH: Final = Workspace.high.tolist()
+
+
+class Controller:
+    """The controller of one arm; `data` is to be as `mujoco.mj_step1` leaves it."""
+
+    def __init__(self, scene: Scene, data: Any) -> None:
+        self.scene, self.data = scene, data
+        self._jacobian = np.zeros((6, 7))
+        self._lower = scene.lower + JOINT_MARGIN
+        self._upper = scene.upper - JOINT_MARGIN
+        self._moved = np.zeros(7)
+        self._wanted = np.zeros((6, 2))
+        self._task = np.zeros((7, 2))
+
+    def jacobian(self) -> FloatArray:
+        """Return J at the present state, shape (6, 7), in an array that the next call reuses."""
+        mujoco.mj_jacSite(
+            self.scene.model, self.data, self._jacobian[:3], self._jacobian[3:], self.scene.tip
+        )
+        return self._jacobian
+
+    def joint_command(self, velocity: FloatArray, posture: FloatArray = POSTURE) -> JointCommand:
+        """Return joint velocities that move the tip with `velocity`, in m/s, shape (3,)."""
+        data = self.data
+        q = data.qpos
+        jacobian = self.jacobian()
+        resting = POSTURE_GAIN * (posture - q)
+        wanted = self._wanted
+        wanted[:, 0] = -jacobian @ resting
+        wanted[3:, 0] += ORIENTATION_GAIN * self.rotation_error()
+        velocity = self._eased(velocity, jacobian)
+        wanted[:3, 1] = velocity
+        task = jacobian.T @ np.linalg.solve(self._damped(jacobian), wanted)
+        low, high = self.speed_limits()
+        free = np.minimum(np.maximum(resting + task[:, 0], low), high)
+        commanded = task[:, 1]
+        scale = _largest_scale(free, commanded, low, high)
+        if scale > 0.0:
+            scale = min(scale, Workspace.scale(data.site_xpos[self.scene.tip], velocity))
+        return JointCommand(free + scale * commanded, scale)
+
+    def _eased(self, velocity: FloatArray, jacobian: FloatArray) -> FloatArray:
+        """Return the velocity that the tip's acceleration limit lets it have after this step."""
+        present = jacobian[:3] @ self.data.qvel
+        change = velocity - present
+        most = TIP_ACCELERATION * CONTROL_DT
+        if float(change @ change) <= most**2:
+            return velocity
+        # Along the command and across it apart: pressing on a head must not let the tip slide.
+        speed = float(np.sqrt(velocity @ velocity))
+        along = velocity * (float(change @ velocity) / speed**2) if speed > 0 else np.zeros(3)
+        eased = present + _shortened(along, most) + _shortened(change - along, most)
+        return np.asarray(eased, dtype=np.float64)
+
+    def rotation_error(self) -> FloatArray:
+        """Return e, which turns the stick back into its fixed orientation, in rad, shape (3,)."""
+        r = self.data.site_xmat[self.scene.tip].tolist()
+        return np.array([0.5 * (r[5] - r[7]), 0.5 * (r[6] - r[2]), 0.5 * (r[1] - r[3])])
+
+    def _damped(self, jacobian: FloatArray) -> FloatArray:
+        gram = jacobian @ jacobian.T
+        square = float(np.linalg.det(gram))
+        if square < MANIPULABILITY**2:
+            w = np.sqrt(max(square, 0.0))
+            gram[np.diag_indices(6)] += (DAMPING * (1.0 - w / MANIPULABILITY)) ** 2
+        return gram
+
+    def speed_limits(self) -> tuple[FloatArray, FloatArray]:
+        """Return the least and the greatest velocity of each joint that its limits allow now."""
+        q = self.data.qpos
+        low = np.maximum((self._lower - q) / BRAKING_TIME, -SPEED_LIMITS)
+        high = np.minimum((self._upper - q) / BRAKING_TIME, SPEED_LIMITS)
+        return np.minimum(low, SPEED_LIMITS), np.maximum(high, -SPEED_LIMITS)
+
+    def torque(self, velocity: FloatArray) -> FloatArray:
+        """Return the torques that bring the joints to `velocity` within a control step."""
+        data = self.data
+        change = (velocity - data.qvel) / CONTROL_DT
+        mujoco.mj_mulM(self.scene.model, data, self._moved, change)
+        torque = self.going_on() + self._moved
+        limited: FloatArray = np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
+        return limited
+
+    def going_on(self) -> FloatArray:
+        """Return h, the torques that keep the joint velocities, shape (7,)."""
+        going_on: FloatArray = self.data.qfrc_bias - self.data.qfrc_passive
+        return going_on
+
+    def guarded(self, torque: FloatArray) -> tuple[FloatArray, float]:
+        """Return what is applied of commanded torques, within the joints' limits, and the share.
+
+        The joint velocities that the torques would bring about within a control step obey the
+        limits that commands of the tip obey; the torques are scaled as a whole until they do.
+        """
+        data = self.data
+        low, high = self.speed_limits()
+        going_on = self.going_on()
+        both = np.stack([-going_on, torque])
+        mujoco.mj_solveM(self.scene.model, data, both, both.copy())
+        free = data.qvel + CONTROL_DT * both[0]
+        kept = np.minimum(np.maximum(free, low), high)
+        scale = _largest_scale(kept, CONTROL_DT * both[1], low, high)
+        target = kept + scale * CONTROL_DT * both[1]
+        return self.torque(target), scale
+
+
+def _shortened(vector: FloatArray, most: float) -> FloatArray:
+    size = float(np.sqrt(vector @ vector))
+    return vector if size <= most else (most / size) * vector
+
+
+def _largest_scale(free: FloatArray, part: FloatArray, low: FloatArray, high: FloatArray) -> float:
+    """Return the largest s in [0, 1] with low <= free + s part <= high; free is within."""
+    room = np.where(part > 0, high - free, free - low)
+    size = np.abs(part)
+    over = size > room
+    if not over.any():
+        return 1.0
+    return float(max((room[over] / size[over]).min(), 0.0))

@@ -1,0 +1,685 @@
+"""Drumming with a robot arm: the paper's robot experiment (sec. IV-D) in MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, SupportsFloat, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, Drum, load_drums
+from iflow_gym.demonstrations import Demonstrations, FloatArray
+from iflow_gym.envs.drumming.control import CONTROL_DT, Workspace
+from iflow_gym.envs.drumming.progress import Progress, progress_along
+from iflow_gym.envs.drumming.scene import TORQUE_LIMITS
+from iflow_gym.envs.drumming.simulation import Simulation, UnreachableError
+from iflow_gym.envs.dynamics import scaled_into_box
+from iflow_gym.envs.task import RESET_OPTIONS, START_NOISE, Push
+from iflow_gym.metrics.drumming import Hit, implied_score
+
+if TYPE_CHECKING:
+    from iflow_gym.envs.drumming.rendering import Renderer
+
+ControlMode = Literal["velocity", "torque"]
+
+MAX_SPEED: Final = 1.0
+"""Speed of the tip in m/s of an action component of 1: three times the demonstrations' peak."""
+
+ON_ORBIT: Final = 0.05
+"""Distance from the demonstrations that is success, in diagonals of their bounding box."""
+
+OBSERVABLES: Final = ("tip", "tip_velocity", "joints", "force", "phase")
+"""What an observation can be made of."""
+
+START_DRAWS: Final = 20
+"""Random starts that are tried before the demonstration's own first sample is taken."""
+
+
+@dataclass(frozen=True)
+class ForcePush:
+    """A perturbation: a steady force on the stick's tip for a while."""
+
+    fraction: float = 0.5
+    """When it begins: this fraction of the way, counted in the demonstration's own steps. Half way
+    is the middle of the third stroke of the demonstrations of `iflow/Drumming-v0`."""
+    impulse: float = 4.0
+    """Force times duration, in N s."""
+    duration: float = 0.1
+    """In s; rounded to control steps, at least one."""
+    direction: tuple[float, float, float] | None = None
+    """Where to (any length but 0); None draws a direction from the environment's generator."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fraction <= 1:
+            raise ValueError(f"Expected a push's fraction in (0, 1], got {self.fraction}.")
+        if not (np.isfinite(self.impulse) and self.impulse >= 0):
+            raise ValueError(f"Expected a push's impulse >= 0 and finite, got {self.impulse}.")
+        if not (np.isfinite(self.duration) and self.duration > 0):
+            raise ValueError(f"Expected a push's duration > 0 and finite, got {self.duration}.")
+
+
+class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
+    r"""Drum with a robot arm the way the demonstrations do.
+
+    ## Description
+    A seven-joint Franka arm stands before two drums with a stick in its hand, in MuJoCo. The
+    motion is that of the ImitationFlow paper's robot experiment: an arch between the drums, high
+    over on the way to the right one, low on the way back, a sharp turn on either head, about 5 s a
+    round. A policy sees where the stick's tip is and says how it should move; a controller turns
+    that into torques of the joints, with the stick's orientation held. A good policy goes round on
+    the demonstrated orbit, comes back to it after a push, and hits each drum when the
+    demonstrations do.
+
+    Physics run at 1 kHz, control at 100 Hz. Lengths are metres in the frame of the arm's base: x
+    forward, y to the left, z up. The head of a drum gives way softly, and stops the tip: what a
+    command asks beyond it becomes force.
+
+    `env.unwrapped` has `demonstrations`, `drums`, `dt`, `max_speed`, `n_dims`, the conversions
+    `velocity_to_action`, `action_to_velocity` and `command_to_action`, `score_of` (the notes that
+    a demonstration implies), `get_dataset` and `score`; wrappers hide them.
+
+    ## Action Space
+    An action whose largest component exceeds 1 is divided by it, as a whole: no component is
+    clipped by itself. Float64 actions are used at full precision.
+
+    | control_mode | space | action component | -1 | 1 |
+    | --- | --- | --- | --- | --- |
+    | `"velocity"` (default) | `Box(-1, 1, (3,), float32)` | velocity of the tip | -1 m/s | 1 m/s |
+    | `"torque"` | `Box(-1, 1, (7,), float32)` | torque of a joint | -limit | limit |
+
+    A velocity is held for a control step; the arm reaches it at the step's end. Joint limits, speed
+    limits, torque limits and the border of the workspace slow a command as a whole
+    (`info["command_scale"]`), and never bend it: `iflow_gym.envs.drumming.control` has the
+    equations. Torques, of up to 87 N m (joints 1 to 4) and 12 N m (5 to 7), come on top of the
+    compensation of gravity; they too are scaled as a whole so that the joints keep their limits.
+
+    ## Observation Space
+    `Box(float64)`, the parts that `observe` names, in its order; the tip comes first always.
+
+    | part | size | quantity | min | max | unit |
+    | --- | --- | --- | --- | --- | --- |
+    | `"tip"` (default) | 3 | position of the tip | -2 | 2 | m |
+    | `"tip_velocity"` | 3 | velocity of the tip | -10 | 10 | m/s |
+    | `"joints"` | 7 | joint angles | limits - 0.1 | limits + 0.1 | rad |
+    | | 7 | joint velocities | -20 | 20 | rad/s |
+    | `"force"` | 2 | largest force on each head in the last step | 0 | 2000 | N |
+    | `"phase"` | 2 | cosine and sine of 2 pi time / period | -1 | 1 | - |
+
+    The tip is kept within the workspace: x from 0.58 to 0.88, y from -0.4 to 0.4, z from 0.13 to
+    0.7, and at most 0.77 m from (0.36, 0, -0.03).
+
+    ## Rewards
+    Progress along the demonstrations, in [-1, 1]: about 1 a step for a replay, 0 for standing
+    still, -1 for going back. `iflow_gym.envs.drumming.progress` has the equation.
+
+    ## Starting State
+    The first sample of a demonstration drawn uniformly, plus Gaussian noise with a standard
+    deviation of `start_noise` diagonals of the demonstrations' bounding box a component, moving as
+    the demonstration does. With `reset(options={"demonstration": i})` exactly the first sample of
+    demonstration i. With `reset(options={"start": x})` the position x at rest; with both the
+    position x, at rest, and the length of demonstration i. The arm is in the posture of that
+    position that is nearest to its normal one. A start that is out of reach or inside a drum raises
+    an error.
+
+    ## Episode End
+    Truncated after `horizon` steps, by default as many as the demonstration has. Never terminated.
+    No `TimeLimit` is needed, since the environment truncates by itself.
+
+    ## Arguments
+    | argument | default | meaning |
+    | --- | --- | --- |
+    | `demonstrations` | `None` | of a cycle within the workspace; `None` takes the suite's six |
+    | `drums` | `None` | tuple of `iflow_gym.datasets.drums.Drum`; `None` takes the suite's two |
+    | `control_mode` | `"velocity"` | or `"torque"` |
+    | `observe` | `("tip",)` | parts of the observation |
+    | `horizon` | `None` | steps an episode; `None` takes the demonstration's own |
+    | `start_noise` | `0.02` | standard deviation of random starts, in diagonals |
+    | `perturbation` | `None` | a `Push` or a `ForcePush`, see Perturbations |
+    | `render_mode` | `None` | `"rgb_array"`; needs OpenGL |
+    | `width`, `height` | `640`, `480` | of a picture, in pixels |
+
+    ## Info
+    The same keys after a reset and after every step.
+
+    | key | type | meaning |
+    | --- | --- | --- |
+    | `is_success` | bool | within 5 % of the bounding box's diagonal of the demonstrations |
+    | `distance_to_orbit` | float | m from the demonstrations' nearest sample |
+    | `time` | float | seconds since the reset |
+    | `dt` | float | seconds a step |
+    | `demonstration` | int | index of the demonstration, -1 for a start of the caller's choice |
+    | `pushed` | bool | whether the push has begun |
+    | `hits` | tuple | of `Hit(time, drum, force)`: what this step decided, see Hits |
+    | `forces` | array, shape (2,) | largest normal force on each head in this step, N |
+    | `target` | array, shape (3,) | where the command wanted the tip at the step's end, m |
+    | `command_scale` | float | how much of the command the limits let through |
+
+    In torque mode `target` is where the tip is.
+
+    ## Hits
+    A contact of the stick with a head of at least 2 N that none preceded on that drum within
+    0.1 s. Its `time` is that of the onset, to the millisecond; its `force` the largest within
+    0.05 s. It is reported when that is known, 0.05 s after the onset, or in the episode's last
+    step.
+
+    ## Perturbations
+    Both come once, `fraction` of the way; 0.5 is in the middle of a stroke. A `Push(fraction,
+    size, direction)` moves the arm aside at once, so that the tip is displaced by `size` diagonals,
+    or as far as arm and drums allow; joint velocities stay. A `ForcePush(fraction, impulse,
+    duration, direction)` pushes the tip with a steady force; the controller resists, and 4 N s
+    in 0.1 s move the tip by about 0.1 m, not quite in the direction of the force.
+
+    ## Version History
+    * v0: Initial version. Scores belong to a version of MuJoCo: contacts are solved slightly
+      differently from one to the next.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
+    _resets_needed: ClassVar[str] = "Call reset() before step() and render()."
+
+    def __init__(
+        self,
+        demonstrations: Demonstrations | None = None,
+        drums: tuple[Drum, ...] | None = None,
+        *,
+        control_mode: ControlMode = "velocity",
+        observe: Sequence[str] = ("tip",),
+        horizon: int | None = None,
+        start_noise: float = START_NOISE,
+        perturbation: Push | ForcePush | None = None,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+    ) -> None:
+        self._demonstrations = _checked(load_drums() if demonstrations is None else demonstrations)
+        self.drums: tuple[Drum, ...] = DRUMS if drums is None else tuple(drums)
+        if control_mode not in ("velocity", "torque"):
+            raise ValueError(f"Expected control_mode 'velocity' or 'torque', got {control_mode!r}.")
+        if horizon is not None and (not isinstance(horizon, int | np.integer) or horizon < 1):
+            raise ValueError(
+                f"Expected horizon to be a whole number of steps >= 1, got {horizon!r}: leave it "
+                "out for as many steps as the demonstration has."
+            )
+        if not (np.isfinite(start_noise) and start_noise >= 0):
+            raise ValueError(
+                f"Expected start_noise >= 0 (a fraction of the diagonal), got {start_noise!r}."
+            )
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"Expected render_mode None or 'rgb_array', got {render_mode!r}.")
+        self.control_mode: ControlMode = control_mode
+        self.observe = _checked_parts(observe)
+        self.horizon = None if horizon is None else int(horizon)
+        self.start_noise = float(start_noise)
+        self.perturbation = _checked_push(perturbation)
+        self.render_mode = render_mode
+        self.width, self.height = int(width), int(height)
+        self.diagonal = self._demonstrations.bounding_box.diagonal
+        self.simulation = Simulation(self.drums)
+        self._progress: Progress | None = None
+        size = 3 if control_mode == "velocity" else len(TORQUE_LIMITS)
+        self.action_space = cast(
+            "spaces.Space[FloatArray]", spaces.Box(-1.0, 1.0, (size,), np.float32)
+        )
+        self.observation_space = self._observation_space()
+        self._running = False
+        self._count = self._length = 0
+        self._index = -1
+        self._push_steps = range(0)
+        self._push = np.zeros(3)
+        self._tip = np.zeros(3)
+        self._trail: list[FloatArray] = []
+        self._renderer: Renderer | None = None
+
+    # What it is ---------------------------------------------------------------------------
+
+    @property
+    def demonstrations(self) -> Demonstrations:
+        """The demonstrations of the motion."""
+        return self._demonstrations
+
+    @property
+    def dt(self) -> float:
+        """Seconds a step."""
+        return CONTROL_DT
+
+    @property
+    def n_dims(self) -> int:
+        """Dimension of a position: 3."""
+        return 3
+
+    @property
+    def max_speed(self) -> float:
+        """Speed of the tip in m/s of an action component of 1."""
+        return MAX_SPEED
+
+    def score_of(self, index: int) -> tuple[FloatArray, NDArray[np.intp]]:
+        """Return the notes that a demonstration implies: times in s and drums, shape (n,) each."""
+        return implied_score(
+            self.demonstrations.positions[index],
+            self.demonstrations.dt[index],
+            [drum.head for drum in self.drums],
+            [drum.radius for drum in self.drums],
+            tip_radius=TIP_RADIUS,
+        )
+
+    def reachable(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Which positions, shape (n, 3), an episode can start from; shape (n,).
+
+        The state of a running episode is lost: reset afterwards.
+        """
+        self._running = False
+        found = []
+        for point in np.asarray(points, dtype=np.float64).reshape(-1, 3):
+            try:
+                self.simulation.place(point)
+            except UnreachableError:
+                found.append(False)
+            else:
+                found.append(True)
+        return np.array(found, dtype=np.bool_)
+
+    # Conversions --------------------------------------------------------------------------
+
+    def velocity_to_action(self, velocity: ArrayLike) -> FloatArray:
+        """Return the action of a velocity in m/s, shape (..., 3), scaled to fit the box."""
+        self._expect_velocity_mode("velocity_to_action")
+        return scaled_into_box(_vectors(velocity, "velocity") / MAX_SPEED)
+
+    def action_to_velocity(self, action: ArrayLike) -> FloatArray:
+        """Return the velocity in m/s that an action, shape (..., 3), commands."""
+        self._expect_velocity_mode("action_to_velocity")
+        return scaled_into_box(_vectors(action, "action")) * MAX_SPEED
+
+    def command_to_action(
+        self, velocity_command: ArrayLike, observation: ArrayLike, dt: float | None = None
+    ) -> FloatArray:
+        """Return the action that carries out a velocity command, in either control mode.
+
+        In velocity mode that is the command as a fraction of `max_speed`. In torque mode it is what
+        the velocity mode's controller would apply; it depends on the joints, and so on the running
+        episode's present state, whatever the observation: one command, shape (3,), at a time.
+
+        Parameters
+        ----------
+        velocity_command : array, shape (..., 3)
+            In m/s.
+        observation : array, shape (..., size of an observation)
+            The state that the command is given in.
+        dt : float, seconds, optional
+            For the interface's sake: a step is always `dt` long.
+        """
+        command = _vectors(velocity_command, "velocity command")
+        state = np.asarray(observation, dtype=np.float64)
+        size = cast("tuple[int, ...]", self.observation_space.shape)[0]
+        if state.ndim == 0 or state.shape[-1] != size:
+            raise ValueError(f"Expected observations of shape (..., {size}), got {state.shape}.")
+        if self.control_mode == "velocity":
+            return scaled_into_box(command / MAX_SPEED)
+        if command.shape != (3,):
+            raise ValueError(
+                f"Expected one velocity command, shape (3,), in torque mode, got {command.shape}: "
+                "its torques depend on the state of this environment's joints."
+            )
+        if not self._running:
+            raise gymnasium.error.ResetNeeded(self._resets_needed)
+        wanted = scaled_into_box(command / MAX_SPEED) * MAX_SPEED
+        controller = self.simulation.controller
+        torque: FloatArray = controller.torque(controller.joint_command(wanted).velocity)
+        action: FloatArray = torque / TORQUE_LIMITS
+        return action
+
+    def _expect_velocity_mode(self, name: str) -> None:
+        if self.control_mode != "velocity":
+            raise ValueError(
+                f"Expected control_mode='velocity' for {name}, got 'torque': there an action is "
+                "joint torques; use command_to_action(velocity, observation)."
+            )
+
+    # Episodes -----------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Begin an episode; see Starting State for the options."""
+        super().reset(seed=seed)
+        demos = self.demonstrations
+        wanted, start = self._checked_options(options)
+        self._running = False
+        index = wanted
+        if index is None and start is None:
+            index = int(self.np_random.integers(len(demos)))
+        if start is not None:
+            self.simulation.place(start)
+        else:
+            assert index is not None
+            self._place_at_demonstration(index, noisy=wanted is None)
+        self._index = -1 if index is None else index
+        steps = round(float(demos.durations.mean()) / CONTROL_DT)
+        if index is not None:
+            steps = len(demos.positions[index]) - 1
+        self._length = steps if self.horizon is None else self.horizon
+        self._plan_push(steps)
+        self._count = 0
+        self._running = True
+        self._tip = self.simulation.tip
+        self._trail = [self._tip] if self.render_mode is not None else []
+        return self._observation(), self._info(
+            self._tip, 1.0, (), self._field().distance(self._tip)
+        )
+
+    def _place_at_demonstration(self, index: int, *, noisy: bool) -> None:
+        first = self.demonstrations.positions[index][0]
+        velocity = self.demonstrations.velocities[index][0]
+        if noisy and self.start_noise > 0:
+            for _ in range(START_DRAWS):
+                noise = self.start_noise * self.diagonal * self.np_random.standard_normal(3)
+                try:
+                    return self.simulation.place(first + noise, velocity)
+                except UnreachableError:
+                    continue
+        return self.simulation.place(first, velocity)
+
+    def _plan_push(self, steps: int) -> None:
+        push = self.perturbation
+        self._push_steps = range(0)
+        if push is None:
+            return
+        direction = (
+            self.np_random.standard_normal(3)
+            if push.direction is None
+            else np.asarray(push.direction, dtype=np.float64)
+        )
+        direction = direction / np.linalg.norm(direction)
+        begin = max(1, round(push.fraction * steps))
+        if isinstance(push, ForcePush):
+            n = max(1, round(push.duration / CONTROL_DT))
+            self._push_steps = range(begin, begin + n)
+            self._push = push.impulse / (n * CONTROL_DT) * direction
+        else:
+            self._push_steps = range(begin, begin + 1)
+            self._push = push.size * self.diagonal * direction
+
+    def step(
+        self, action: FloatArray
+    ) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Hold an action for a control step."""
+        if not self._running:
+            raise gymnasium.error.ResetNeeded(self._resets_needed)
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape:
+            raise ValueError(
+                f"Expected an action of shape {self.action_space.shape}, got {values.shape}."
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"Expected a finite action, got {values}: the policy gave NaN or infinity."
+            )
+        values = scaled_into_box(values)
+        simulation, before = self.simulation, self._tip
+        controller = simulation.controller
+        if self.control_mode == "velocity":
+            velocity = MAX_SPEED * values
+            command = controller.joint_command(velocity)
+            torque, scale = controller.torque(command.velocity), command.scale
+            target = before + CONTROL_DT * velocity
+        else:
+            torque, scale = controller.guarded(values * TORQUE_LIMITS)
+            target = None
+        self._count += 1
+        pushing = self._count in self._push_steps
+        is_force = isinstance(self.perturbation, ForcePush)
+        hits = simulation.advance(torque, self._push if pushing and is_force else None)
+        reached = simulation.tip
+        reward, distance = self._field().of_step(before, reached, CONTROL_DT)
+        self._tip = reached
+        if pushing and not is_force:
+            simulation.displace(self._push)
+            self._tip = simulation.tip
+            distance = self._field().distance(self._tip)
+        truncated = self._count >= self._length
+        if truncated:
+            hits += simulation.pending_hits()
+        if self.render_mode is not None:
+            self._trail.append(self._tip)
+        info = self._info(reached if target is None else target, scale, tuple(hits), distance)
+        return self._observation(), reward, False, truncated, info
+
+    def _field(self) -> Progress:
+        if self._progress is None:
+            self._progress = progress_along(self.demonstrations)
+        return self._progress
+
+    def _info(
+        self, target: FloatArray, scale: float, hits: tuple[Hit, ...], distance: float
+    ) -> dict[str, Any]:
+        return {
+            "is_success": distance <= ON_ORBIT * self.diagonal,
+            "distance_to_orbit": distance,
+            "time": self._count * CONTROL_DT,
+            "dt": CONTROL_DT,
+            "demonstration": self._index,
+            "pushed": len(self._push_steps) > 0 and self._count >= self._push_steps[0],
+            "hits": hits,
+            "forces": np.array(self.simulation.peak_forces),
+            "target": np.array(target),
+            "command_scale": scale,
+        }
+
+    def _observation(self) -> FloatArray:
+        if self.observe == ("tip",):
+            return self._tip.copy()
+        data = self.simulation.data
+        angle = 2 * np.pi * self._count * CONTROL_DT / cast("float", self.demonstrations.period)
+        parts: dict[str, Callable[[], FloatArray]] = {
+            "tip": lambda: self._tip,
+            "tip_velocity": lambda: self.simulation.tip_velocity,
+            "joints": lambda: np.concatenate([data.qpos, data.qvel]),
+            "force": lambda: np.array(self.simulation.peak_forces),
+            "phase": lambda: np.array([np.cos(angle), np.sin(angle)]),
+        }
+        return np.concatenate([parts[name]() for name in self.observe])
+
+    def _observation_space(self) -> spaces.Space[FloatArray]:
+        scene, n = self.simulation.scene, len(self.drums)
+        high = {
+            "tip": np.full(3, 2.0),
+            "tip_velocity": np.full(3, 10.0),
+            "joints": np.concatenate([scene.upper + 0.1, np.full(7, 20.0)]),
+            "force": np.full(n, 2000.0),
+            "phase": np.ones(2),
+        }
+        low = {name: -bound for name, bound in high.items()}
+        low["joints"] = np.concatenate([scene.lower - 0.1, np.full(7, -20.0)])
+        low["force"] = np.zeros(n)
+        least, most = (np.concatenate([end[name] for name in self.observe]) for end in (low, high))
+        return cast("spaces.Space[FloatArray]", spaces.Box(least, most, dtype=np.float64))
+
+    def _checked_options(
+        self, options: Mapping[str, Any] | None
+    ) -> tuple[int | None, FloatArray | None]:
+        options = options or {}
+        if unknown := sorted(set(options) - set(RESET_OPTIONS)):
+            raise ValueError(
+                f"Expected reset options among {list(RESET_OPTIONS)}, got {unknown}: use "
+                "{'demonstration': i} to start where recording i does, {'start': x} to start at x."
+            )
+        index, start = options.get("demonstration"), options.get("start")
+        if index is not None:
+            count = len(self.demonstrations)
+            number = np.asarray(index)
+            if number.dtype.kind not in "iu" or number.shape not in ((), (1,)):
+                raise TypeError(
+                    "Expected options['demonstration'] to be a whole number from 0 to "
+                    f"{count - 1}, got {index!r}."
+                )
+            index = int(number.reshape(()))
+            if not 0 <= index < count:
+                raise ValueError(
+                    f"Expected options['demonstration'] from 0 to {count - 1} ({count} recordings "
+                    f"of {self.demonstrations.name!r}), got {index}."
+                )
+        if start is not None:
+            try:
+                start = np.asarray(start, dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise TypeError(
+                    f"Expected options['start'] to be numbers, got {start!r}."
+                ) from error
+            if start.shape != (3,) or not np.isfinite(start).all():
+                raise ValueError(
+                    "Expected options['start'] to be a finite position of shape (3,), got "
+                    f"{start!r}."
+                )
+        return index, start
+
+    # Data, scores, pictures ---------------------------------------------------------------
+
+    def get_dataset(
+        self, split: str = "reproduction", part: str = "fit"
+    ) -> dict[str, NDArray[Any]]:
+        """Return the demonstrations as transitions of this environment, under D4RL's keys.
+
+        Parameters
+        ----------
+        split : str
+            A protocol of `Demonstrations.split`.
+        part : {"fit", "score"}
+            The recordings to fit on, or those to score on.
+
+        Returns
+        -------
+        dict of arrays, N transitions, one recording after the other
+            ``observations`` and ``next_observations`` (N, size of an observation), ``actions``
+            (N, 3) or (N, 7), ``rewards`` (N,), all float64; ``terminals`` (N,), all false;
+            ``timeouts`` (N,), true at the last transition of each recording.
+
+        Notes
+        -----
+        The recordings are played by the arm, without push: the command at each sample is the one
+        that leads to the recording's next. So the observations are what the arm did, within
+        millimetres of the recording.
+        """
+        parts = self.demonstrations.split(split)
+        if part not in parts._fields:
+            raise ValueError(f"Expected part {' or '.join(parts._fields)}, got {part!r}.")
+        demos = getattr(parts, part)
+        player = DrummingEnv(
+            self.demonstrations, self.drums, control_mode=self.control_mode, observe=self.observe
+        )
+        rows: dict[str, list[Any]] = {key: [] for key in _DATASET_KEYS}
+        for index, positions in enumerate(self.demonstrations.positions):
+            if not any(positions is p for p in demos.positions):
+                continue
+            observation, _ = player.reset(options={"demonstration": index})
+            for following in positions[1:]:
+                velocity = (following - observation[:3]) / CONTROL_DT
+                action = player.command_to_action(velocity, observation)
+                arrived, reward, terminal, timeout, _ = player.step(action)
+                transition = (observation, action, arrived, reward, terminal, timeout)
+                for key, value in zip(_DATASET_KEYS, transition, strict=True):
+                    rows[key].append(value)
+                observation = arrived
+        return {key: np.array(values) for key, values in rows.items()}
+
+    def score(self, system_or_policy: Any, seed: int) -> dict[str, float]:
+        """Score a system or a policy on this environment: see `iflow_gym.envs.drumming.scoring`."""
+        from iflow_gym.envs.drumming.scoring import score
+
+        return score(system_or_policy, self, seed)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture, shape (height, width, 3)."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render() was called without a render_mode: pass render_mode='rgb_array' to "
+                "gymnasium.make."
+            )
+            return None
+        if not self._running:
+            raise gymnasium.error.ResetNeeded(self._resets_needed)
+        if self._renderer is None:
+            from iflow_gym.envs.drumming.rendering import Renderer
+
+            self._renderer = Renderer(self.simulation.scene, self.width, self.height)
+        simulation = self.simulation
+        return self._renderer.frame(simulation.data, self._trail, simulation.peak_forces)
+
+    def close(self) -> None:
+        """Free what OpenGL holds."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+_DATASET_KEYS = (
+    "observations",
+    "actions",
+    "next_observations",
+    "rewards",
+    "terminals",
+    "timeouts",
+)
+
+
+def _checked(demonstrations: Demonstrations) -> Demonstrations:
+    if not isinstance(demonstrations, Demonstrations):
+        raise TypeError(
+            f"Expected Demonstrations, got {type(demonstrations).__name__}: make them with "
+            "Demonstrations.from_arrays(..., period=...)."
+        )
+    if demonstrations.n_dims != 3 or demonstrations.period is None:
+        raise ValueError(
+            "Expected demonstrations of a cycle in 3-D, got "
+            f"{demonstrations.n_dims} dimensions and period {demonstrations.period}."
+        )
+    if any(abs(dt - CONTROL_DT) > 1e-9 for dt in demonstrations.dt):
+        raise ValueError(
+            f"Expected demonstrations with dt = {CONTROL_DT} s, the arm's control step, got "
+            f"{demonstrations.dt}: resample them."
+        )
+    if not np.all([Workspace.contains(p).all() for p in demonstrations.positions]):
+        raise ValueError(
+            "Expected demonstrations within the arm's workspace, x, y, z from "
+            f"{Workspace.low.tolist()} to {Workspace.high.tolist()}, got samples outside: move "
+            "them by a rigid transform."
+        )
+    return demonstrations
+
+
+def _checked_parts(observe: Sequence[str]) -> tuple[str, ...]:
+    parts = (observe,) if isinstance(observe, str) else tuple(observe)
+    if unknown := [name for name in parts if name not in OBSERVABLES]:
+        raise ValueError(f"Expected observe among {list(OBSERVABLES)}, got {unknown}.")
+    if parts[:1] != ("tip",) or len(set(parts)) < len(parts):
+        raise ValueError(
+            f"Expected observe to begin with 'tip' and to name each part once, got {parts}: a "
+            "policy finds the position first."
+        )
+    return parts
+
+
+def _checked_push(push: Push | ForcePush | None) -> Push | ForcePush | None:
+    if push is None:
+        return None
+    if not isinstance(push, Push | ForcePush):
+        raise TypeError(f"Expected perturbation to be a Push, a ForcePush or None, got {push!r}.")
+    if push.direction is not None:
+        direction = np.asarray(push.direction, dtype=np.float64)
+        length = np.linalg.norm(direction) if direction.shape == (3,) else 0.0
+        if not (np.isfinite(length) and length > 0):
+            raise ValueError(
+                "Expected a push's direction to have 3 finite components, not all zero, got "
+                f"{push.direction!r}."
+            )
+    return push
+
+
+def _vectors(values: ArrayLike, label: str) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"Expected a {label} of shape (..., 3), got {array.shape}.")
+    return array
