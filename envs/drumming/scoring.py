@@ -24,6 +24,7 @@ RECOVERED_TIME: Final = 1.0
 
 METRICS: Final = (
     "hit_f1",
+    "sequence_f1",
     "timing_error",
     "tempo_error",
     "missed",
@@ -87,6 +88,7 @@ def score(system_or_policy: Any, env: DrummingEnv, seed: int) -> dict[str, float
         rows.append(
             {
                 "hit_f1": metrics.hit_f1(*together),
+                "sequence_f1": metrics.sequence_f1(*together),
                 "timing_error": metrics.timing_error(*together),
                 "tempo_error": metrics.tempo_error(*together),
                 "missed": float(metrics.missed(*together)),
