@@ -72,7 +72,8 @@ def score(system_or_policy: Any, env: DrummingEnv, seed: int) -> dict[str, float
         last second. A policy that returns nan or infinity has run away: what it would have hit is
         missed, ``rmse`` is infinite.
     """
-    from iflow_gym.envs.drumming.env import DrummingEnv, ForcePush
+    from iflow_gym.envs.drumming.arguments import ForcePush
+    from iflow_gym.envs.drumming.env import DrummingEnv
 
     demos = env.demonstrations
     settings: dict[str, Any] = {"control_mode": env.control_mode, "observe": env.observe}

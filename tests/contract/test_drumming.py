@@ -16,8 +16,9 @@ import iflow_gym  # noqa: F401  (registers the ids)
 from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, load_drums
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.envs.drumming import recorded, scoring
+from iflow_gym.envs.drumming.arguments import OBSERVABLES, ForcePush
 from iflow_gym.envs.drumming.control import JOINT_MARGIN, Workspace
-from iflow_gym.envs.drumming.env import OBSERVABLES, DrummingEnv, ForcePush
+from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, assets_folder
 from iflow_gym.envs.drumming.simulation import UnreachableError
 from iflow_gym.envs.task import Push
