@@ -510,6 +510,19 @@ def test_a_policy_that_stands_still_or_runs_away_misses_everything():
         env.score(3, seed=0)
 
 
+def test_a_fitted_method_is_scored_through_its_policy(env):
+    from iflow_gym.baselines.imitation_flow import ImitationFlow
+
+    system = ImitationFlow(n_steps=20).fit(env.demonstrations, seed=0)
+    played = scoring.perform(system, env, 0)
+    start = env.demonstrations.positions[0][0]
+    np.testing.assert_allclose(played.path[0], start, atol=1e-5)
+    first = (played.targets[0] - played.path[0]) / env.dt
+    step = system.step(played.path[0], env.dt) - played.path[0]
+    np.testing.assert_allclose(first, step / env.dt, atol=1e-6)
+    assert metrics.tracking_rmse(played.targets, played.path[1:]) < 1.0
+
+
 # The authors' recording -------------------------------------------------------------------------
 
 
@@ -642,6 +655,27 @@ def test_without_opengl_the_error_says_what_to_install():
     assert done.returncode == 3, done.stderr
     assert "install libegl1" in done.stdout
     assert "MUJOCO_GL=egl" in done.stdout
+
+
+HIDE = """
+import ctypes, ctypes.util
+load = ctypes.CDLL
+def load_others(name, *args, **kwargs):
+    if any(part in str(name) for part in ("GL", "Mesa")):
+        raise OSError(name)
+    return load(name, *args, **kwargs)
+ctypes.CDLL = load_others
+"""
+
+
+def test_a_library_that_is_missing_hinders_pictures_only():
+    """As on a machine where MUJOCO_GL names a library that is not there."""
+    steps = PICTURE.replace("try:", "env.step([0.0, 0.0, 0.1])\nprint('stepped')\ntry:")
+    for variables in ({"MUJOCO_GL": "egl"}, {"MUJOCO_GL": ""}):
+        done = run_python(HIDE + steps, **variables)
+        assert done.returncode == 3, done.stderr
+        assert done.stdout.startswith("stepped")
+        assert "install libegl1" in done.stdout
 
 
 def test_a_missing_model_is_named(monkeypatch):
