@@ -658,13 +658,13 @@ def test_without_opengl_the_error_says_what_to_install():
 
 
 HIDE = """
-import ctypes, ctypes.util
-load = ctypes.CDLL
-def load_others(name, *args, **kwargs):
+import ctypes
+open_library = ctypes._dlopen
+def open_others(name, *args):
     if any(part in str(name) for part in ("GL", "Mesa")):
         raise OSError(name)
-    return load(name, *args, **kwargs)
-ctypes.CDLL = load_others
+    return open_library(name, *args)
+ctypes._dlopen = open_others
 """
 
 
