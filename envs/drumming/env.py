@@ -264,6 +264,19 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
                 found.append(True)
         return np.array(found, dtype=np.bool_)
 
+    def like(self, perturbation: Push | ForcePush | None = None) -> DrummingEnv:
+        """Return another arm at the same drums, without pictures, horizon and perturbation.
+
+        A perturbation may be given.
+        """
+        return DrummingEnv(
+            self.demonstrations,
+            self.drums,
+            control_mode=self.control_mode,
+            observe=self.observe,
+            perturbation=perturbation,
+        )
+
     # Conversions --------------------------------------------------------------------------
 
     def velocity_to_action(self, velocity: ArrayLike) -> FloatArray:
@@ -507,27 +520,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         that leads to the recording's next. So the observations are what the arm did, within
         millimetres of the recording.
         """
-        parts = self.demonstrations.split(split)
-        if part not in parts._fields:
-            raise ValueError(f"Expected part {' or '.join(parts._fields)}, got {part!r}.")
-        demos = getattr(parts, part)
-        player = DrummingEnv(
-            self.demonstrations, self.drums, control_mode=self.control_mode, observe=self.observe
-        )
-        rows: dict[str, list[Any]] = {key: [] for key in _DATASET_KEYS}
-        for index, positions in enumerate(self.demonstrations.positions):
-            if not any(positions is p for p in demos.positions):
-                continue
-            observation, _ = player.reset(options={"demonstration": index})
-            for following in positions[1:]:
-                velocity = (following - observation[:3]) / CONTROL_DT
-                action = player.command_to_action(velocity, observation)
-                arrived, reward, terminal, timeout, _ = player.step(action)
-                transition = (observation, action, arrived, reward, terminal, timeout)
-                for key, value in zip(_DATASET_KEYS, transition, strict=True):
-                    rows[key].append(value)
-                observation = arrived
-        return {key: np.array(values) for key, values in rows.items()}
+        from iflow_gym.envs.drumming.dataset import transitions
+
+        return transitions(self, split, part)
 
     def score(self, system_or_policy: Any, seed: int) -> dict[str, float]:
         """Score a system or a policy on this environment: see `iflow_gym.envs.drumming.scoring`."""
@@ -557,13 +552,3 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-_DATASET_KEYS = (
-    "observations",
-    "actions",
-    "next_observations",
-    "rewards",
-    "terminals",
-    "timeouts",
-)
