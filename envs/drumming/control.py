@@ -28,10 +28,10 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
-import mujoco
 import numpy as np
 
 from iflow_gym.demonstrations import FloatArray
+from iflow_gym.envs.drumming.engine import mujoco
 from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, Scene
 
 CONTROL_DT: Final = 0.01

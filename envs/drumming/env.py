@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, SupportsFloat, cast
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Final, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
@@ -13,18 +12,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, Drum, load_drums
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.envs.drumming.control import CONTROL_DT, Workspace
+from iflow_gym.envs.drumming.arguments import (
+    ControlMode,
+    ForcePush,
+    checked_demonstrations,
+    checked_options,
+    checked_parts,
+    checked_push,
+    vectors,
+)
+from iflow_gym.envs.drumming.control import CONTROL_DT
 from iflow_gym.envs.drumming.progress import Progress, progress_along
 from iflow_gym.envs.drumming.scene import TORQUE_LIMITS
 from iflow_gym.envs.drumming.simulation import Simulation, UnreachableError
 from iflow_gym.envs.dynamics import scaled_into_box
-from iflow_gym.envs.task import RESET_OPTIONS, START_NOISE, Push
+from iflow_gym.envs.task import START_NOISE, Push
 from iflow_gym.metrics.drumming import Hit, implied_score
 
 if TYPE_CHECKING:
     from iflow_gym.envs.drumming.rendering import Renderer
-
-ControlMode = Literal["velocity", "torque"]
 
 MAX_SPEED: Final = 1.0
 """Speed of the tip in m/s of an action component of 1: three times the demonstrations' peak."""
@@ -32,34 +38,8 @@ MAX_SPEED: Final = 1.0
 ON_ORBIT: Final = 0.05
 """Distance from the demonstrations that is success, in diagonals of their bounding box."""
 
-OBSERVABLES: Final = ("tip", "tip_velocity", "joints", "force", "phase")
-"""What an observation can be made of."""
-
 START_DRAWS: Final = 20
 """Random starts that are tried before the demonstration's own first sample is taken."""
-
-
-@dataclass(frozen=True)
-class ForcePush:
-    """A perturbation: a steady force on the stick's tip for a while."""
-
-    fraction: float = 0.5
-    """When it begins: this fraction of the way, counted in the demonstration's own steps. Half way
-    is the middle of the third stroke of the demonstrations of `iflow/Drumming-v0`."""
-    impulse: float = 4.0
-    """Force times duration, in N s."""
-    duration: float = 0.1
-    """In s; rounded to control steps, at least one."""
-    direction: tuple[float, float, float] | None = None
-    """Where to (any length but 0); None draws a direction from the environment's generator."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.fraction <= 1:
-            raise ValueError(f"Expected a push's fraction in (0, 1], got {self.fraction}.")
-        if not (np.isfinite(self.impulse) and self.impulse >= 0):
-            raise ValueError(f"Expected a push's impulse >= 0 and finite, got {self.impulse}.")
-        if not (np.isfinite(self.duration) and self.duration > 0):
-            raise ValueError(f"Expected a push's duration > 0 and finite, got {self.duration}.")
 
 
 class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
@@ -195,7 +175,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         width: int = 640,
         height: int = 480,
     ) -> None:
-        self._demonstrations = _checked(load_drums() if demonstrations is None else demonstrations)
+        self._demonstrations = checked_demonstrations(
+            load_drums() if demonstrations is None else demonstrations
+        )
         self.drums: tuple[Drum, ...] = DRUMS if drums is None else tuple(drums)
         if control_mode not in ("velocity", "torque"):
             raise ValueError(f"Expected control_mode 'velocity' or 'torque', got {control_mode!r}.")
@@ -211,10 +193,10 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"Expected render_mode None or 'rgb_array', got {render_mode!r}.")
         self.control_mode: ControlMode = control_mode
-        self.observe = _checked_parts(observe)
+        self.observe = checked_parts(observe)
         self.horizon = None if horizon is None else int(horizon)
         self.start_noise = float(start_noise)
-        self.perturbation = _checked_push(perturbation)
+        self.perturbation = checked_push(perturbation)
         self.render_mode = render_mode
         self.width, self.height = int(width), int(height)
         self.diagonal = self._demonstrations.bounding_box.diagonal
@@ -282,17 +264,30 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
                 found.append(True)
         return np.array(found, dtype=np.bool_)
 
+    def like(self, perturbation: Push | ForcePush | None = None) -> DrummingEnv:
+        """Return another arm at the same drums, without pictures, horizon and perturbation.
+
+        A perturbation may be given.
+        """
+        return DrummingEnv(
+            self.demonstrations,
+            self.drums,
+            control_mode=self.control_mode,
+            observe=self.observe,
+            perturbation=perturbation,
+        )
+
     # Conversions --------------------------------------------------------------------------
 
     def velocity_to_action(self, velocity: ArrayLike) -> FloatArray:
         """Return the action of a velocity in m/s, shape (..., 3), scaled to fit the box."""
         self._expect_velocity_mode("velocity_to_action")
-        return scaled_into_box(_vectors(velocity, "velocity") / MAX_SPEED)
+        return scaled_into_box(vectors(velocity, "velocity") / MAX_SPEED)
 
     def action_to_velocity(self, action: ArrayLike) -> FloatArray:
         """Return the velocity in m/s that an action, shape (..., 3), commands."""
         self._expect_velocity_mode("action_to_velocity")
-        return scaled_into_box(_vectors(action, "action")) * MAX_SPEED
+        return scaled_into_box(vectors(action, "action")) * MAX_SPEED
 
     def command_to_action(
         self, velocity_command: ArrayLike, observation: ArrayLike, dt: float | None = None
@@ -312,7 +307,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         dt : float, seconds, optional
             For the interface's sake: a step is always `dt` long.
         """
-        command = _vectors(velocity_command, "velocity command")
+        command = vectors(velocity_command, "velocity command")
         state = np.asarray(observation, dtype=np.float64)
         size = cast("tuple[int, ...]", self.observation_space.shape)[0]
         if state.ndim == 0 or state.shape[-1] != size:
@@ -347,7 +342,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         """Begin an episode; see Starting State for the options."""
         super().reset(seed=seed)
         demos = self.demonstrations
-        wanted, start = self._checked_options(options)
+        wanted, start = checked_options(self.demonstrations, options)
         self._running = False
         index = wanted
         if index is None and start is None:
@@ -498,44 +493,6 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         least, most = (np.concatenate([end[name] for name in self.observe]) for end in (low, high))
         return cast("spaces.Space[FloatArray]", spaces.Box(least, most, dtype=np.float64))
 
-    def _checked_options(
-        self, options: Mapping[str, Any] | None
-    ) -> tuple[int | None, FloatArray | None]:
-        options = options or {}
-        if unknown := sorted(set(options) - set(RESET_OPTIONS)):
-            raise ValueError(
-                f"Expected reset options among {list(RESET_OPTIONS)}, got {unknown}: use "
-                "{'demonstration': i} to start where recording i does, {'start': x} to start at x."
-            )
-        index, start = options.get("demonstration"), options.get("start")
-        if index is not None:
-            count = len(self.demonstrations)
-            number = np.asarray(index)
-            if number.dtype.kind not in "iu" or number.shape not in ((), (1,)):
-                raise TypeError(
-                    "Expected options['demonstration'] to be a whole number from 0 to "
-                    f"{count - 1}, got {index!r}."
-                )
-            index = int(number.reshape(()))
-            if not 0 <= index < count:
-                raise ValueError(
-                    f"Expected options['demonstration'] from 0 to {count - 1} ({count} recordings "
-                    f"of {self.demonstrations.name!r}), got {index}."
-                )
-        if start is not None:
-            try:
-                start = np.asarray(start, dtype=np.float64)
-            except (TypeError, ValueError) as error:
-                raise TypeError(
-                    f"Expected options['start'] to be numbers, got {start!r}."
-                ) from error
-            if start.shape != (3,) or not np.isfinite(start).all():
-                raise ValueError(
-                    "Expected options['start'] to be a finite position of shape (3,), got "
-                    f"{start!r}."
-                )
-        return index, start
-
     # Data, scores, pictures ---------------------------------------------------------------
 
     def get_dataset(
@@ -563,27 +520,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         that leads to the recording's next. So the observations are what the arm did, within
         millimetres of the recording.
         """
-        parts = self.demonstrations.split(split)
-        if part not in parts._fields:
-            raise ValueError(f"Expected part {' or '.join(parts._fields)}, got {part!r}.")
-        demos = getattr(parts, part)
-        player = DrummingEnv(
-            self.demonstrations, self.drums, control_mode=self.control_mode, observe=self.observe
-        )
-        rows: dict[str, list[Any]] = {key: [] for key in _DATASET_KEYS}
-        for index, positions in enumerate(self.demonstrations.positions):
-            if not any(positions is p for p in demos.positions):
-                continue
-            observation, _ = player.reset(options={"demonstration": index})
-            for following in positions[1:]:
-                velocity = (following - observation[:3]) / CONTROL_DT
-                action = player.command_to_action(velocity, observation)
-                arrived, reward, terminal, timeout, _ = player.step(action)
-                transition = (observation, action, arrived, reward, terminal, timeout)
-                for key, value in zip(_DATASET_KEYS, transition, strict=True):
-                    rows[key].append(value)
-                observation = arrived
-        return {key: np.array(values) for key, values in rows.items()}
+        from iflow_gym.envs.drumming.dataset import transitions
+
+        return transitions(self, split, part)
 
     def score(self, system_or_policy: Any, seed: int) -> dict[str, float]:
         """Score a system or a policy on this environment: see `iflow_gym.envs.drumming.scoring`."""
@@ -613,73 +552,3 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-_DATASET_KEYS = (
-    "observations",
-    "actions",
-    "next_observations",
-    "rewards",
-    "terminals",
-    "timeouts",
-)
-
-
-def _checked(demonstrations: Demonstrations) -> Demonstrations:
-    if not isinstance(demonstrations, Demonstrations):
-        raise TypeError(
-            f"Expected Demonstrations, got {type(demonstrations).__name__}: make them with "
-            "Demonstrations.from_arrays(..., period=...)."
-        )
-    if demonstrations.n_dims != 3 or demonstrations.period is None:
-        raise ValueError(
-            "Expected demonstrations of a cycle in 3-D, got "
-            f"{demonstrations.n_dims} dimensions and period {demonstrations.period}."
-        )
-    if any(abs(dt - CONTROL_DT) > 1e-9 for dt in demonstrations.dt):
-        raise ValueError(
-            f"Expected demonstrations with dt = {CONTROL_DT} s, the arm's control step, got "
-            f"{demonstrations.dt}: resample them."
-        )
-    if not np.all([Workspace.contains(p).all() for p in demonstrations.positions]):
-        raise ValueError(
-            "Expected demonstrations within the arm's workspace, x, y, z from "
-            f"{Workspace.low.tolist()} to {Workspace.high.tolist()}, got samples outside: move "
-            "them by a rigid transform."
-        )
-    return demonstrations
-
-
-def _checked_parts(observe: Sequence[str]) -> tuple[str, ...]:
-    parts = (observe,) if isinstance(observe, str) else tuple(observe)
-    if unknown := [name for name in parts if name not in OBSERVABLES]:
-        raise ValueError(f"Expected observe among {list(OBSERVABLES)}, got {unknown}.")
-    if parts[:1] != ("tip",) or len(set(parts)) < len(parts):
-        raise ValueError(
-            f"Expected observe to begin with 'tip' and to name each part once, got {parts}: a "
-            "policy finds the position first."
-        )
-    return parts
-
-
-def _checked_push(push: Push | ForcePush | None) -> Push | ForcePush | None:
-    if push is None:
-        return None
-    if not isinstance(push, Push | ForcePush):
-        raise TypeError(f"Expected perturbation to be a Push, a ForcePush or None, got {push!r}.")
-    if push.direction is not None:
-        direction = np.asarray(push.direction, dtype=np.float64)
-        length = np.linalg.norm(direction) if direction.shape == (3,) else 0.0
-        if not (np.isfinite(length) and length > 0):
-            raise ValueError(
-                "Expected a push's direction to have 3 finite components, not all zero, got "
-                f"{push.direction!r}."
-            )
-    return push
-
-
-def _vectors(values: ArrayLike, label: str) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 0 or array.shape[-1] != 3:
-        raise ValueError(f"Expected a {label} of shape (..., 3), got {array.shape}.")
-    return array

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes.util
 import importlib
 import os
 import weakref
@@ -10,17 +9,14 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Final
 
-import mujoco
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
 from iflow_gym.demonstrations import FloatArray
+from iflow_gym.envs.drumming.engine import LIBRARIES, has_library, mujoco
 from iflow_gym.envs.drumming.scene import Scene
 from iflow_gym.metrics.drumming import FORCE_THRESHOLD
-
-BACKENDS: Final = {"egl": "EGL", "osmesa": "OSMesa"}
-"""Name for `MUJOCO_GL` -> library, in the order in which they are tried."""
 
 INSTALL: Final = (
     "Rendering needs OpenGL without a window: install libegl1 (with a GPU, or Mesa's software "
@@ -35,8 +31,8 @@ STRUCK_COLOUR: Final = (0.95, 0.71, 0.02)
 TRAIL_COLOUR: Final = (0.10, 0.45, 0.75)
 
 
-def open_context(width: int, height: int) -> Any:
-    """Return an OpenGL context without a window.
+def open_context(model: Any, width: int, height: int) -> tuple[Any, Any]:
+    """Return an OpenGL context without a window, made current, and MuJoCo's own in it.
 
     `MUJOCO_GL` chooses; where it is not set, EGL is taken if its library is there, else OSMesa.
 
@@ -47,19 +43,22 @@ def open_context(width: int, height: int) -> Any:
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted in ("", "on", "enable", "1", "true"):
-        found = [name for name, library in BACKENDS.items() if ctypes.util.find_library(library)]
+        found = [backend for backend in LIBRARIES if has_library(backend)]
         if not found:
             raise DependencyNotInstalled(INSTALL)
         wanted = found[0]
-    if wanted not in (*BACKENDS, "glfw", "glx"):
+    if wanted not in (*LIBRARIES, "glfw", "glx"):
         raise DependencyNotInstalled(f"MUJOCO_GL={wanted!r} does not render. {INSTALL}")
-    name = wanted if wanted in BACKENDS else "glfw"
+    name = wanted if wanted in LIBRARIES else "glfw"
     try:
-        return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        gl = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        gl.make_current()
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
     except Exception as error:  # PyOpenGL raises whatever is at hand
         raise DependencyNotInstalled(
             f"OpenGL by {wanted} could not be used ({type(error).__name__}: {error}). {INSTALL}"
         ) from error
+    return gl, context
 
 
 class Renderer:
@@ -74,9 +73,7 @@ class Renderer:
                 f"{width} x {height}."
             )
         self._model, self._heads = model, scene.head_geoms
-        self._gl = open_context(width, height)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._gl, self._context = open_context(model, width, height)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._options = mujoco.MjvOption()

@@ -26,6 +26,7 @@ import numpy as np
 
 from iflow_gym.datasets.drums import TIP_RADIUS, Drum
 from iflow_gym.demonstrations import FloatArray
+from iflow_gym.envs.drumming.engine import mujoco
 
 PHYSICS_DT: Final = 0.001
 """Seconds a physics step."""
@@ -94,8 +95,6 @@ class Scene:
 @lru_cache(maxsize=8)
 def load_scene(drums: tuple[Drum, ...]) -> Scene:
     """Compile the scene, once a process for each kit."""
-    import mujoco
-
     model = mujoco.MjModel.from_xml_string(scene_xml(drums))
     heads = {model.geom(f"head:{drum.name}").id: i for i, drum in enumerate(drums)}
     stick = [model.geom(name).id for name in ("stick:bead", "stick:shaft")]
@@ -292,8 +291,6 @@ def _text(value: Any) -> str:
 
 
 def _quaternion(rotation: FloatArray) -> FloatArray:
-    import mujoco
-
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
     return quaternion

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iflow_gym.demonstrations import FloatArray
+from iflow_gym.envs.drumming.arguments import ForcePush
 from iflow_gym.metrics import drumming as metrics
 from iflow_gym.metrics.accuracy import rmse
 
@@ -24,6 +25,7 @@ RECOVERED_TIME: Final = 1.0
 
 METRICS: Final = (
     "hit_f1",
+    "sequence_f1",
     "timing_error",
     "tempo_error",
     "missed",
@@ -71,12 +73,8 @@ def score(system_or_policy: Any, env: DrummingEnv, seed: int) -> dict[str, float
         last second. A policy that returns nan or infinity has run away: what it would have hit is
         missed, ``rmse`` is infinite.
     """
-    from iflow_gym.envs.drumming.env import DrummingEnv, ForcePush
-
     demos = env.demonstrations
-    settings: dict[str, Any] = {"control_mode": env.control_mode, "observe": env.observe}
-    free = DrummingEnv(demos, env.drums, **settings)
-    pushed = DrummingEnv(demos, env.drums, perturbation=ForcePush(), **settings)
+    free, pushed = env.like(), env.like(ForcePush())
     seeds = np.random.default_rng(seed).integers(2**31, size=len(demos)).tolist()
     rows = []
     for index, positions in enumerate(demos.positions):
@@ -87,6 +85,7 @@ def score(system_or_policy: Any, env: DrummingEnv, seed: int) -> dict[str, float
         rows.append(
             {
                 "hit_f1": metrics.hit_f1(*together),
+                "sequence_f1": metrics.sequence_f1(*together),
                 "timing_error": metrics.timing_error(*together),
                 "tempo_error": metrics.tempo_error(*together),
                 "missed": float(metrics.missed(*together)),

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-import mujoco
 import numpy as np
 
 from iflow_gym.datasets.drums import Drum
 from iflow_gym.demonstrations import FloatArray
 from iflow_gym.envs.drumming.control import CONTROL_DT, POSTURE, Controller, Workspace
+from iflow_gym.envs.drumming.engine import mujoco
 from iflow_gym.envs.drumming.scene import PHYSICS_DT, load_scene
 from iflow_gym.metrics.drumming import Hit, HitDetector
 

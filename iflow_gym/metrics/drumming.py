@@ -290,6 +290,44 @@ def hit_f1(
     return 2.0 * pairs / (notes + hits) if notes + hits else 1.0
 
 
+def sequence_f1(
+    score_times: ArrayLike, score_drums: ArrayLike, hit_times: ArrayLike, hit_drums: ArrayLike
+) -> float:
+    r"""F1 of the drums' order alone, whenever they are hit.
+
+    .. math:: F_1 = \frac{2 \ell}{n_\text{notes} + n_\text{hits}}
+
+    with l the length of the longest common subsequence of the drums in the score and those that
+    were hit, each in order of time. It tells a performance at another tempo, which `hit_f1` counts
+    as all wrong, from one that hits the wrong drum, one twice, or none.
+
+    Parameters
+    ----------
+    score_times, score_drums, hit_times, hit_drums
+        As in `match`, whose errors are raised.
+
+    Returns
+    -------
+    float
+        In [0, 1], at least `hit_f1` where matched hits are in the score's order; 1 for silence that
+        was asked for.
+    """
+    notes_at, notes_on = _played(score_times, score_drums, "score")
+    hits_at, hits_on = _played(hit_times, hit_drums, "hit")
+    notes = notes_on[np.argsort(notes_at, kind="stable")].tolist()
+    hits = hits_on[np.argsort(hits_at, kind="stable")].tolist()
+    if not notes and not hits:
+        return 1.0
+    lengths = [0] * (len(hits) + 1)
+    for note in notes:
+        diagonal = 0
+        for j, hit in enumerate(hits, start=1):
+            above = lengths[j]
+            lengths[j] = diagonal + 1 if note == hit else max(above, lengths[j - 1])
+            diagonal = above
+    return 2.0 * lengths[-1] / (len(notes) + len(hits))
+
+
 def missed(
     score_times: ArrayLike,
     score_drums: ArrayLike,

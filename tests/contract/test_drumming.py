@@ -16,8 +16,9 @@ import iflow_gym  # noqa: F401  (registers the ids)
 from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, load_drums
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.envs.drumming import recorded, scoring
+from iflow_gym.envs.drumming.arguments import OBSERVABLES, ForcePush
 from iflow_gym.envs.drumming.control import JOINT_MARGIN, Workspace
-from iflow_gym.envs.drumming.env import OBSERVABLES, DrummingEnv, ForcePush
+from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, assets_folder
 from iflow_gym.envs.drumming.simulation import UnreachableError
 from iflow_gym.envs.task import Push
@@ -480,7 +481,7 @@ def test_get_dataset():
 def test_the_replay_scores_as_a_perfect_drummer(env):
     scores = env.score(Replay(), seed=0)
     assert list(scores) == list(scoring.METRICS)
-    assert scores["hit_f1"] == 1.0
+    assert scores["hit_f1"] == scores["sequence_f1"] == 1.0
     assert scores["missed"] == scores["extra"] == 0.0
     assert scores["timing_error"] < 5
     assert scores["tempo_error"] < 0.002
@@ -500,13 +501,26 @@ def test_a_policy_that_stands_still_or_runs_away_misses_everything():
 
     still, away = env.score(Fixed([0.0] * 3), seed=0), env.score(Fixed([np.nan] * 3), seed=0)
     for scores in (still, away):
-        assert scores["hit_f1"] == 0.0
+        assert scores["hit_f1"] == scores["sequence_f1"] == 0.0
         assert scores["missed"] == 4.0
         assert scores["timing_error"] == scores["tempo_error"] == np.inf
     assert np.isfinite(still["rmse"])
     assert away["rmse"] == np.inf
     with pytest.raises(TypeError, match="Expected a fitted method or a policy"):
         env.score(3, seed=0)
+
+
+def test_a_fitted_method_is_scored_through_its_policy(env):
+    from iflow_gym.baselines.imitation_flow import ImitationFlow
+
+    system = ImitationFlow(n_steps=20).fit(env.demonstrations, seed=0)
+    played = scoring.perform(system, env, 0)
+    start = env.demonstrations.positions[0][0]
+    np.testing.assert_allclose(played.path[0], start, atol=1e-5)
+    first = (played.targets[0] - played.path[0]) / env.dt
+    step = system.step(played.path[0], env.dt) - played.path[0]
+    np.testing.assert_allclose(first, step / env.dt, atol=1e-6)
+    assert metrics.tracking_rmse(played.targets, played.path[1:]) < 1.0
 
 
 # The authors' recording -------------------------------------------------------------------------
@@ -641,6 +655,27 @@ def test_without_opengl_the_error_says_what_to_install():
     assert done.returncode == 3, done.stderr
     assert "install libegl1" in done.stdout
     assert "MUJOCO_GL=egl" in done.stdout
+
+
+HIDE = """
+import ctypes
+open_library = ctypes._dlopen
+def open_others(name, *args):
+    if any(part in str(name) for part in ("GL", "Mesa")):
+        raise OSError(name)
+    return open_library(name, *args)
+ctypes._dlopen = open_others
+"""
+
+
+def test_a_library_that_is_missing_hinders_pictures_only():
+    """As on a machine where MUJOCO_GL names a library that is not there."""
+    steps = PICTURE.replace("try:", "env.step([0.0, 0.0, 0.1])\nprint('stepped')\ntry:")
+    for variables in ({"MUJOCO_GL": "egl"}, {"MUJOCO_GL": ""}):
+        done = run_python(HIDE + steps, **variables)
+        assert done.returncode == 3, done.stderr
+        assert done.stdout.startswith("stepped")
+        assert "install libegl1" in done.stdout
 
 
 def test_a_missing_model_is_named(monkeypatch):

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 import iflow_gym  # noqa: F401  (registers the ids)
-from iflow_gym.envs.drumming.env import ForcePush
+from iflow_gym.envs.drumming.arguments import ForcePush
 from iflow_gym.registration import DRUMMING_ID
 
 PATH = Path(__file__).with_suffix(".json")

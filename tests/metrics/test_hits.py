@@ -215,6 +215,31 @@ def test_tempo_is_the_median_and_does_not_mind_one_extra_hit():
         m.tempo_error([1.0, 2.0], [0, 1], *SCORE)
 
 
+@pytest.mark.parametrize(
+    ("drums", "common"),
+    [
+        ([0, 1, 0, 1], 4),
+        ([0, 0, 1, 1], 3),
+        ([1, 0, 1, 0], 3),
+        ([0], 1),
+        ([0, 1, 1, 0, 1], 4),
+        ([2], 0),
+    ],
+)
+def test_sequence_f1_knows_only_the_order(drums, common):
+    times = 10 + np.arange(len(drums)) * 0.3
+    assert m.sequence_f1(*SCORE, times, drums) == pytest.approx(2 * common / (4 + len(drums)))
+    shuffled = np.random.default_rng(0).permutation(len(drums))
+    assert m.sequence_f1(*SCORE, times[shuffled], np.array(drums)[shuffled]) == m.sequence_f1(
+        *SCORE, times, drums
+    )
+
+
+def test_sequence_f1_of_silence():
+    assert m.sequence_f1([], [], [], []) == 1.0
+    assert m.sequence_f1(*SCORE, [], []) == 0.0
+
+
 def brute_force(notes, hits, tolerance):
     """The most pairs over every way of giving each note a hit or none."""
     best = 0
