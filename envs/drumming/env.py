@@ -21,6 +21,7 @@ from iflow_gym.envs.drumming.arguments import (
     checked_push,
     vectors,
 )
+from iflow_gym.envs.drumming.arms import Arms
 from iflow_gym.envs.drumming.control import CONTROL_DT
 from iflow_gym.envs.drumming.progress import Progress, progress_along
 from iflow_gym.envs.drumming.scene import TORQUE_LIMITS
@@ -159,6 +160,8 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
+    motion: ClassVar[Motion] = "drumming"
+    rivals: ClassVar[tuple[str, ...]] = ()
     _resets_needed: ClassVar[str] = "Call reset() before step() and render()."
 
     def __init__(
@@ -264,18 +267,29 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
                 found.append(True)
         return np.array(found, dtype=np.bool_)
 
-    def like(self, perturbation: Push | ForcePush | None = None) -> DrummingEnv:
-        """Return another arm at the same drums, without pictures, horizon and perturbation.
+    def like(
+        self,
+        num_envs: int | None = None,
+        *,
+        horizon: int | None = None,
+        perturbation: Push | ForcePush | None = None,
+    ) -> Any:
+        """Return another arm at the same drums, or `Arms`, a batch of `num_envs` of them.
 
-        A perturbation may be given.
+        Its horizon and perturbation are its own; there are no pictures.
         """
-        return DrummingEnv(
-            self.demonstrations,
-            self.drums,
-            control_mode=self.control_mode,
-            observe=self.observe,
-            perturbation=perturbation,
-        )
+        arms = [
+            DrummingEnv(
+                self.demonstrations,
+                self.drums,
+                control_mode=self.control_mode,
+                observe=self.observe,
+                horizon=horizon,
+                perturbation=perturbation,
+            )
+            for _ in range(1 if num_envs is None else num_envs)
+        ]
+        return arms[0] if num_envs is None else Arms(arms)
 
     # Conversions --------------------------------------------------------------------------
 
