@@ -80,7 +80,7 @@ def still() -> None:
     for path in demos.positions:
         space.plot(*path.T, color=INK, linewidth=0.9, alpha=0.7)
     space.plot(*demos.positions[SHOWN].T, color=ROLLOUT, linewidth=1.8)
-    space.set_box_aspect((1.0, 1.6, 1.0), zoom=1.15)
+    space.set_box_aspect((1.0, 1.6, 1.0))
     space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", xticks=[0.6, 0.7, 0.8])
     space.view_init(elev=14, azim=-22)
     space.set_title("six demonstrations of the stick's tip", fontsize=10, color=INK)
