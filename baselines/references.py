@@ -44,7 +44,7 @@ class NearestDemonstration:
     def evaluate(self, env: Any, *, seed: int, protocol: str) -> Evaluation:
         """Score the demonstrations against each other; there is nothing random in it."""
         fitted, scored = env.unwrapped.demonstrations.split(protocol)
-        motion = motion_of(scored)
+        motion = motion_of(env.unwrapped)
         if motion == "goal":
             rows = [_distances(shown, fitted) for shown in scored.positions]
         else:

@@ -24,6 +24,7 @@ from iflow_gym.envs.dynamics import (
     scaled_into_box,
 )
 from iflow_gym.envs.guide import guide_for
+from iflow_gym.metrics import Motion
 
 ControlMode = Literal["velocity", "force"]
 
@@ -320,6 +321,11 @@ class PointMassInterface:
     rivals: ClassVar[tuple[str, ...]] = ()
     """Ids of environments whose motions a model of this one's is to be told apart from by its
     density, itself among them; none by default."""
+
+    @property
+    def motion(self) -> Motion:
+        """Whether the demonstrations end at a goal or repeat."""
+        return "goal" if self.demonstrations.period is None else "cycle"
 
     def like(
         self,

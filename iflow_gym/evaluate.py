@@ -13,9 +13,7 @@ import gymnasium
 import numpy as np
 
 from iflow_gym import metrics
-from iflow_gym.demonstrations import Demonstrations
-from iflow_gym.envs.task import PointMassInterface
-from iflow_gym.evaluation import cycles, goals
+from iflow_gym.evaluation import cycles, drumming, goals
 from iflow_gym.evaluation.common import (
     PerDemonstration,
     Scores,
@@ -31,7 +29,7 @@ from iflow_gym.system import DynamicalSystem, Method
 
 __all__ = ["FIT_COSTS", "Evaluation", "Policy", "evaluate", "motion_of", "score"]
 
-KINDS: dict[metrics.Motion, Any] = {"goal": goals, "cycle": cycles}
+KINDS: dict[metrics.Motion, Any] = {"goal": goals, "cycle": cycles, "drumming": drumming}
 """Modules that score a motion, by its kind."""
 
 FIT_COSTS = ("fit_seconds", "fit_cpu_seconds", "peak_memory_mb")
@@ -101,7 +99,7 @@ def evaluate(
     Raises
     ------
     TypeError, ValueError
-        If `env` is no point-mass environment, or the policy does not fit it.
+        If `env` is no environment of iflow_gym, or the policy does not fit it.
 
     Notes
     -----
@@ -120,16 +118,15 @@ def evaluate(
     scored = demos.split(protocol).score
     indices = [i for i, p in enumerate(demos.positions) if any(p is q for q in scored.positions)]
     push_rng, state_rng = np.random.default_rng(seed).spawn(2)
-    kind = KINDS[motion_of(demos)]
+    motion = motion_of(task)
+    kind = KINDS[motion]
 
     per_demonstration = kind.accuracy(policy, task, scored, indices)
     if system is not None:
         per_demonstration |= teacher_forced(system, scored)
         if protocol == "generalisation":  # elsewhere nothing is held out
             per_demonstration |= likelihood(system, scored)
-    values: Scores = {
-        m.name: None for m in metrics.metrics_of(motion_of(demos)) if m.name not in FIT_COSTS
-    }
+    values: Scores = {m.name: None for m in metrics.metrics_of(motion) if m.name not in FIT_COSTS}
     if stability:
         pushes = push_rng.integers(2**31, size=len(demos))[indices].tolist()
         found, recovered = kind.stability(policy, task, indices, pushes)
@@ -146,14 +143,13 @@ def evaluate(
     return Evaluation(values, medians, per_demonstration, rivals)
 
 
-def motion_of(demonstrations: Demonstrations) -> metrics.Motion:
-    """Return whether demonstrations end at a goal or repeat."""
-    return "goal" if demonstrations.period is None else "cycle"
+def motion_of(task: Any) -> metrics.Motion:
+    """Return the kind of motion that an unwrapped environment of iflow_gym is of."""
+    motion: metrics.Motion = task.motion
+    return motion
 
 
-def _likelihoods(
-    system: DynamicalSystem, task: PointMassInterface, protocol: str
-) -> dict[str, list[float]]:
+def _likelihoods(system: DynamicalSystem, task: Any, protocol: str) -> dict[str, list[float]]:
     """Return log p(tau) of the scored demonstrations of each of the task's `rivals`."""
     found: dict[str, list[float]] = {}
     for rival in task.rivals:
@@ -168,9 +164,9 @@ def _likelihoods(
     return found
 
 
-def _task_environment(env: Any) -> PointMassInterface:
+def _task_environment(env: Any) -> Any:
     base = (gymnasium.make(env) if isinstance(env, str) else env).unwrapped
-    if not isinstance(base, PointMassInterface):
+    if not all(hasattr(base, name) for name in ("demonstrations", "like", "motion")):
         raise TypeError(
             f"Expected an environment of iflow_gym or its id, got {type(base).__name__}."
         )

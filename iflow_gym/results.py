@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from iflow_gym.demonstrations import PROTOCOLS
-from iflow_gym.metrics import metrics_of
+from iflow_gym.metrics import Motion, metrics_of
 from iflow_gym.system import Guarantee
 
 SCHEMA_VERSION = 1
@@ -137,8 +137,7 @@ def check_metrics(metrics: Mapping[str, float | None]) -> None:
     A negative value is one that only a log-likelihood can have; nan is no value.
     """
     missing = [
-        {metric.name for metric in metrics_of(motion)} - set(metrics)
-        for motion in ("goal", "cycle")
+        {metric.name for metric in metrics_of(motion)} - set(metrics) for motion in get_args(Motion)
     ]
     if all(missing):
         raise ValueError(f"expected every metric, got none of {sorted(missing[0])}")

@@ -45,6 +45,16 @@ RANKED: dict[Motion, tuple[str, ...]] = {
         "seds_error",
         "direction_error",
     ),
+    "drumming": (
+        "rhythm_f1",
+        "sequence_f1",
+        "hit_f1",
+        "timing_error",
+        "tempo_error",
+        "period_error",
+        "orbit_distance",
+        "orbit_hausdorff",
+    ),
 }
 """Metrics whose ranks the mean rank is the mean of: those of the accuracy table."""
 
@@ -237,8 +247,12 @@ def _board(family: str, protocol: str, results: Sequence[Result]) -> Board:
 
 def motion_of(results: Iterable[Result]) -> Motion:
     """Return the kind of motion that records are of: their metrics tell."""
-    cyclic = {m.name for m in metrics_of("cycle")} - {m.name for m in metrics_of("goal")}
-    return "cycle" if any(cyclic <= set(result.metrics) for result in results) else "goal"
+    names = [set(result.metrics) for result in results]
+    kinds: tuple[Motion, ...] = ("drumming", "cycle")  # drumming has the metrics of a cycle, too
+    for motion in kinds:
+        if any({metric.name for metric in metrics_of(motion)} <= own for own in names):
+            return motion
+    return "goal"
 
 
 def _row(environments: tuple[str, ...], results: Sequence[Result], motion: Motion) -> Row:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from typing import get_args
 
 from board import RANKED, Board, motion_of
 from classes import confusion, fraction_right
@@ -40,6 +41,7 @@ STABILITY: dict[Motion, tuple[str, ...]] = {
         "settling_time",
     ),
     "cycle": ("attraction", "diverged", "perturbation_recovery", "lyapunov_violation"),
+    "drumming": ("attraction", "diverged", "perturbation_recovery", "lyapunov_violation"),
 }
 """Columns of the stability table, after the guarantee."""
 
@@ -52,6 +54,7 @@ DENSITY = ("velocity_rmse", "nll_1", "nll_10")
 BY_SHAPE: dict[Motion, tuple[str, ...]] = {
     "goal": ("frechet", "rmse", "dtw", "converged"),
     "cycle": ("orbit_hausdorff", "orbit_distance", "period_error", "attraction"),
+    "drumming": ("rhythm_f1", "hit_f1", "period_error", "attraction"),
 }
 """Metrics that are tabled shape by shape."""
 
@@ -80,6 +83,7 @@ WHAT = {
     "LASA-26": "handwriting motions, each in one way",
     "LASA-Multi": "handwriting motions that are done in several ways",
     "Letter": "letters that are traced round and round, limit cycles in the plane",
+    "Drumming": "arm that drums in MuJoCo, scored on the tip that the physics moved",
     "LetterRecorded": "letters that ImitationFlow's authors recorded, limit cycles in the plane",
 }
 """What the motions of a family are."""
@@ -176,7 +180,7 @@ def _one_line(reason: str) -> str:
 def warnings_about(results: Sequence[Result]) -> list[str]:
     """Return what makes the records hard to compare, one sentence each."""
     found: list[str] = []
-    for motion in ("goal", "cycle"):
+    for motion in get_args(Motion):
         alike = [r for r in results if r.ok and motion_of([r]) == motion]
         current = metrics_hash(motion)
         counts = Counter(r.hashes.get("metrics", "none") for r in alike)

@@ -40,6 +40,8 @@ CORE = (
 NOT_SCORED = (
     "iflow_gym",
     "iflow_gym.datasets",
+    "iflow_gym.envs.drumming.progress",
+    "iflow_gym.envs.drumming.rendering",
     "iflow_gym.envs.guide",
     "iflow_gym.envs.nearest",
     "iflow_gym.envs.rendering",
@@ -50,8 +52,9 @@ NOT_SCORED = (
 """Modules that no score depends on: the data have a hash of their own, rewards are not scored."""
 
 OTHER_MOTIONS: dict[Motion, tuple[str, ...]] = {
-    "goal": ("iflow_gym.evaluation.cycles",),
-    "cycle": ("iflow_gym.evaluation.goals",),
+    "goal": ("iflow_gym.evaluation.cycles", "iflow_gym.evaluation.drumming"),
+    "cycle": ("iflow_gym.evaluation.goals", "iflow_gym.evaluation.drumming"),
+    "drumming": ("iflow_gym.evaluation.goals",),
 }
 """Modules that score motions of another kind than this one."""
 

@@ -12,7 +12,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium
 
@@ -158,7 +158,7 @@ def _reference(name: str) -> Entry:
         config={},
         integrator=None,
         uses_time=reference.uses_time,
-        motions=("goal", "cycle"),
+        motions=get_args(Motion),
         code=code.sha256,
         libraries=code.libraries,
         versions=versions(code.libraries),
@@ -199,8 +199,8 @@ def _method(name: str, preset: str) -> Entry:
 
 def _motions(method: type[Method]) -> tuple[Motion, ...]:
     goal: tuple[Motion, ...] = ("goal",) if method.learns_goals else ()
-    cycle: tuple[Motion, ...] = ("cycle",) if method.learns_cycles else ()
-    return goal + cycle
+    cycles: tuple[Motion, ...] = ("cycle", "drumming") if method.learns_cycles else ()
+    return goal + cycles
 
 
 def select_environments(patterns: Sequence[str]) -> list[str]:
@@ -227,9 +227,14 @@ def family(environment: str) -> str:
 
 
 @cache
+def task_of(environment: str) -> Any:
+    """Return an environment, unwrapped."""
+    return gymnasium.make(environment).unwrapped
+
+
 def demonstrations_of(environment: str) -> Demonstrations:
     """Return an environment's demonstrations."""
-    demonstrations: Demonstrations = gymnasium.make(environment).unwrapped.demonstrations  # type: ignore[attr-defined]
+    demonstrations: Demonstrations = task_of(environment).demonstrations
     return demonstrations
 
 
@@ -274,7 +279,7 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
     for entry in entries:
         seeds = preset.seeds if entry.stochastic else preset.seeds[:1]
         used = {name: entry.versions.get(name) for name in (*CORE_LIBRARIES, *entry.libraries)}
-        learned = [e for e in environments if motion_of(demonstrations_of(e)) in entry.motions]
+        learned = [e for e in environments if motion_of(task_of(e)) in entry.motions]
         for protocol, seed, batch in product(
             preset.protocols, seeds, make_batches(learned, batched=entry.batched)
         ):
@@ -282,7 +287,7 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
             paths = tuple(str(result_path(entry.name, e, protocol, seed)) for e in batch)
             data = [demonstrations_of(environment).sha256 for environment in batch]
             for environment, sha256 in zip(batch, data, strict=True):
-                motion = motion_of(demonstrations_of(environment))
+                motion = motion_of(task_of(environment))
                 hashes = {
                     "data": sha256,
                     "metrics": metrics_hash(motion),

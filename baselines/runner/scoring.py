@@ -18,7 +18,7 @@ import psutil
 
 from iflow_gym.baselines.registry import load_method, load_reference
 from iflow_gym.baselines.runner.fingerprint import hardware
-from iflow_gym.baselines.runner.plan import Cell, demonstrations_of, family
+from iflow_gym.baselines.runner.plan import Cell, demonstrations_of, family, task_of
 from iflow_gym.evaluate import Evaluation, evaluate, motion_of
 from iflow_gym.metrics import FitCost, measure_cost, metrics_of
 from iflow_gym.results import Result, check_metrics
@@ -112,7 +112,7 @@ def scored_reference(cell: Cell) -> Result:
 def _record(cell: Cell, found: Evaluation, *, costs: dict[str, float], **known: Any) -> Result:
     values = found.metrics | costs
     demonstrations = demonstrations_of(cell.environment)
-    metrics = {m.name: values.get(m.name) for m in metrics_of(motion_of(demonstrations))}
+    metrics = {m.name: values.get(m.name) for m in metrics_of(motion_of(task_of(cell.environment)))}
     check_metrics(metrics)
     return Result(
         **_common(cell),

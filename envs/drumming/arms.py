@@ -1,4 +1,4 @@
-"""Several arms that a policy moves side by side, one after the other: what scores are taken from."""
+"""Several arms that a policy moves side by side: what scores are taken from."""
 
 from __future__ import annotations
 

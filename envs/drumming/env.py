@@ -28,6 +28,7 @@ from iflow_gym.envs.drumming.scene import TORQUE_LIMITS
 from iflow_gym.envs.drumming.simulation import Simulation, UnreachableError
 from iflow_gym.envs.dynamics import scaled_into_box
 from iflow_gym.envs.task import START_NOISE, Push
+from iflow_gym.metrics import Motion
 from iflow_gym.metrics.drumming import Hit, implied_score
 
 if TYPE_CHECKING:
@@ -540,9 +541,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
 
         return transitions(self, split, part)
 
-    def score(self, system_or_policy: Any, seed: int) -> dict[str, float]:
-        """Score a system or a policy on this environment: see `iflow_gym.envs.drumming.scoring`."""
-        from iflow_gym.envs.drumming.scoring import score
+    def score(self, system_or_policy: Any, seed: int) -> dict[str, float | None]:
+        """Score a system or a policy on this environment: see `iflow_gym.evaluate.score`."""
+        from iflow_gym.evaluate import score
 
         return score(system_or_policy, self, seed)
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from iflow_gym import metrics
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.envs.task import PointMassInterface
 from iflow_gym.evaluation.rollouts import bind, scored_box
 from iflow_gym.system import DynamicalSystem
 
@@ -89,7 +88,7 @@ def lyapunov_violation(
     return metrics.lyapunov_violation(rates, states, demos.goal)
 
 
-def step_us(policy: Any, task: PointMassInterface, scored: Demonstrations) -> float:
+def step_us(policy: Any, task: Any, scored: Demonstrations) -> float:
     """Return the median time of a call with a single state, along the first demonstration.
 
     A policy's own state goes from call to call, as in an episode.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from iflow_gym import metrics
-from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.envs.task import PointMassInterface
 from iflow_gym.evaluation.common import PerDemonstration, Scores
 from iflow_gym.evaluation.rollouts import (
@@ -33,10 +33,16 @@ def accuracy(
     number does not grow with how many demonstrations there are. The period is compared with the
     mean of theirs: the tempo of one recording is no property of the motion.
     """
+    period = mean_period(scored)
+    n_steps = PERIODS * max(samples(period, dt) for dt in scored.dt)
+    return scores_of(rollouts_from_starts(policy, task, indices, n_steps), scored)
+
+
+def scores_of(paths: FloatArray, scored: Demonstrations) -> PerDemonstration:
+    """Return the scores of rollouts of eight periods, shape (n, T, d), one a demonstration."""
     size = scored.bounding_box.diagonal
     period = mean_period(scored)
     counts = [samples(period, dt) for dt in scored.dt]
-    paths = rollouts_from_starts(policy, task, indices, PERIODS * max(counts))
     found: PerDemonstration = {}
     for path, recording, dt, n in zip(paths, scored.positions, scored.dt, counts, strict=True):
         path = path[: PERIODS * n + 1]

@@ -328,6 +328,87 @@ def sequence_f1(
     return 2.0 * lengths[-1] / (len(notes) + len(hits))
 
 
+def rhythm(scores: Sequence[tuple[ArrayLike, ArrayLike]]) -> FloatArray:
+    r"""When in a round each drum is hit, the mean of several scores of one note a drum and round.
+
+    Each score's phases are its times over its own round, relative to drum 0; their circular mean
+    over the notes and the scores is taken.
+
+    Parameters
+    ----------
+    scores
+        Times in s and drums, shape (n,) each.
+
+    Returns
+    -------
+    array of shape (n_drums,)
+        In rounds, from 0 to 1; drum 0 is at 0.
+
+    Raises
+    ------
+    ValueError
+        If `match`'s conditions do not hold, or a score has no drum with two notes or lacks a drum.
+    """
+    means = []
+    for times, drums in scores:
+        at, on = _played(times, drums, "score")
+        period = _round(at, on)
+        if period is None or set(on.tolist()) != set(range(int(on.max()) + 1)):
+            raise ValueError(
+                "Expected scores of two rounds with a note for every drum, got drums "
+                f"{on.tolist()}: a shorter one has no rhythm"
+            )
+        turns = np.exp(2j * np.pi * at / period)
+        phases = np.array([turns[on == drum].mean() for drum in range(int(on.max()) + 1)])
+        means.append(phases / phases[0])
+    together = np.mean([phases / np.abs(phases) for phases in means], axis=0)
+    return np.asarray(np.angle(together) / (2 * np.pi) % 1.0)
+
+
+def rhythm_f1(
+    phases: ArrayLike, hit_times: ArrayLike, hit_drums: ArrayLike, tolerance: float = TOLERANCE
+) -> float:
+    r"""F1 of the hits against a rhythm that goes round at the performance's own tempo.
+
+    The notes are at s + (k + phi_d) T^ for all k, with T^ the median interval between successive
+    hits of one drum, from the first hit to the last, and the shift s that matches best. So a steady
+    drummer of the right rhythm scores 1 at any tempo (`tempo_error` says how far off that is), and
+    one who is uneven, misses, doubles, or hits the drums at wrong times of the round does not.
+
+    Parameters
+    ----------
+    phases
+        When in a round each drum is hit, shape (n_drums,), as `rhythm` gives it.
+    hit_times, hit_drums, tolerance
+        As in `match`.
+
+    Returns
+    -------
+    float
+        In [0, 1]; 0 where no drum was hit twice.
+
+    Raises
+    ------
+    ValueError
+        If `match`'s conditions do not hold.
+    """
+    shares = np.asarray(phases, dtype=np.float64)
+    times, drums = _played(hit_times, hit_drums, "hit")
+    period = _round(times, drums)
+    if period is None:
+        return 0.0
+    best = 0.0
+    first, last = times.min(), times.max()
+    rounds = np.arange(-1, np.ceil((last - first) / period) + 2)
+    notes_on = np.tile(np.arange(len(shares)), len(rounds))
+    for time, drum in zip(times.tolist(), drums.tolist(), strict=True):
+        start = first + (time - shares[drum] * period - first) % period
+        notes_at = (start + (rounds[:, None] + shares) * period).ravel()
+        due = (notes_at >= first - tolerance) & (notes_at <= last + tolerance)
+        best = max(best, hit_f1(notes_at[due], notes_on[due], times, drums, tolerance))
+    return best
+
+
 def missed(
     score_times: ArrayLike,
     score_drums: ArrayLike,

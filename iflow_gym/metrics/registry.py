@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Literal
 
-Motion = Literal["goal", "cycle"]
-"""Whether demonstrations end at a goal or repeat with a period."""
+Motion = Literal["goal", "cycle", "drumming"]
+"""Whether demonstrations end at a goal, repeat with a period, or drum, which repeats too."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Metric:
     """Heading in tables."""
     definition: str
     """What it is, in a sentence; the docstrings have the equations."""
-    motions: tuple[Motion, ...] = ("goal", "cycle")
-    """Motions that it is a number of: those that end at a goal, those that repeat, or both."""
+    motions: tuple[Motion, ...] = ("goal", "cycle", "drumming")
+    """Kinds of motion that it is a number of."""
 
 
 METRICS: tuple[Metric, ...] = (
@@ -135,7 +135,7 @@ METRICS: tuple[Metric, ...] = (
         "Orbit distance",
         "Mean distance to the nearest sample between the steady orbit, the rollout's last two of "
         "eight periods, and the demonstration's samples, both ways, averaged.",
-        motions=("cycle",),
+        motions=("cycle", "drumming"),
     ),
     Metric(
         "orbit_hausdorff",
@@ -145,7 +145,7 @@ METRICS: tuple[Metric, ...] = (
         "Orbit Hausdorff",
         "Hausdorff distance between the steady orbit and the demonstration's samples: half of how "
         "far its own rounds lie apart is the least there is.",
-        motions=("cycle",),
+        motions=("cycle", "drumming"),
     ),
     Metric(
         "period_error",
@@ -155,7 +155,7 @@ METRICS: tuple[Metric, ...] = (
         "Period error",
         "Relative error of the period, by autocorrelation, against the mean of the "
         "demonstrations'.",
-        motions=("cycle",),
+        motions=("cycle", "drumming"),
     ),
     Metric(
         "phase_rmse",
@@ -165,7 +165,81 @@ METRICS: tuple[Metric, ...] = (
         "Phase RMSE",
         "RMSE between the demonstration's rounds and the steady orbit, each round at its best "
         "shift in time.",
-        motions=("cycle",),
+        motions=("cycle", "drumming"),
+    ),
+    Metric(
+        "hit_f1",
+        "-",
+        "higher",
+        "accuracy",
+        "Hit F1",
+        "F1 of the hits within 50 ms of a note of their drum in the score that the demonstration "
+        "implies, one to one.",
+        motions=("drumming",),
+    ),
+    Metric(
+        "rhythm_f1",
+        "-",
+        "higher",
+        "accuracy",
+        "Rhythm F1",
+        "F1 of the hits of eight rounds within 50 ms of the rhythm that the demonstrations have in "
+        "common, at the performance's own tempo and start.",
+        motions=("drumming",),
+    ),
+    Metric(
+        "sequence_f1",
+        "-",
+        "higher",
+        "accuracy",
+        "Sequence F1",
+        "F1 of the order of the drums alone, whenever they are hit.",
+        motions=("drumming",),
+    ),
+    Metric(
+        "timing_error",
+        "ms",
+        "lower",
+        "accuracy",
+        "Timing error",
+        "Mean absolute time between matched notes and hits.",
+        motions=("drumming",),
+    ),
+    Metric(
+        "tempo_error",
+        "-",
+        "lower",
+        "accuracy",
+        "Tempo error",
+        "Relative error of the median interval between successive hits of one drum.",
+        motions=("drumming",),
+    ),
+    Metric(
+        "missed",
+        "-",
+        "lower",
+        "accuracy",
+        "Missed",
+        "Notes of the demonstration's score without a hit.",
+        motions=("drumming",),
+    ),
+    Metric(
+        "extra",
+        "-",
+        "lower",
+        "accuracy",
+        "Extra",
+        "Hits that are no note of the demonstration's score.",
+        motions=("drumming",),
+    ),
+    Metric(
+        "tracking_rmse",
+        "mm",
+        "lower",
+        "accuracy",
+        "Tracking RMSE",
+        "Root of the mean squared distance of the tip from where it was commanded to be.",
+        motions=("drumming",),
     ),
     Metric(
         "converged",
@@ -204,7 +278,7 @@ METRICS: tuple[Metric, ...] = (
         "Attraction",
         "Fraction of the starts whose distance to the demonstrations' samples stays within 5 % of "
         "the diagonal over the last of eight periods.",
-        motions=("cycle",),
+        motions=("cycle", "drumming"),
     ),
     Metric(
         "diverged",
@@ -280,6 +354,14 @@ METRICS: tuple[Metric, ...] = (
 FILES: dict[Motion, tuple[str, ...]] = {
     "goal": ("_validation.py", "accuracy.py", "cost.py", "stability.py"),
     "cycle": ("_validation.py", "accuracy.py", "cost.py", "cycles.py", "stability.py"),
+    "drumming": (
+        "_validation.py",
+        "accuracy.py",
+        "cost.py",
+        "cycles.py",
+        "drumming.py",
+        "stability.py",
+    ),
 }
 """Files of this package that compute the metrics of a motion."""
 
@@ -290,7 +372,7 @@ def metrics_of(motion: Motion) -> tuple[Metric, ...]:
     Parameters
     ----------
     motion
-        "goal" or "cycle".
+        "goal", "cycle" or "drumming".
 
     Returns
     -------
