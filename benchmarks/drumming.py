@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from itertools import cycle
 from statistics import median
 from typing import Any
 
@@ -68,8 +69,9 @@ def eight() -> tuple[Step, Callable[[], None]]:
     """Return a function that steps eight arms in processes, and one that ends them."""
     envs = gymnasium.make_vec(f"iflow_gym:{DRUMMING_ID}", num_envs=ARMS, vectorization_mode="async")
     envs.reset(seed=0)
-    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (ARMS, 3)).astype(np.float32)
-    return lambda: envs.step(actions), envs.close
+    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (100, ARMS, 3)).astype(np.float32)
+    turn = cycle([*actions, *-actions])  # there and back, clear of drums and borders
+    return lambda: envs.step(next(turn)), envs.close
 
 
 def drawn() -> Step:

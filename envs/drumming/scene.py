@@ -129,7 +129,7 @@ def scene_xml(drums: Sequence[Drum]) -> str:
         diffuse="0.35 0.35 0.35",
         specular="0.1 0.1 0.1",
     )
-    _element(visual, "quality", shadowsize=4096, offsamples=8)
+    _element(visual, "quality", shadowsize=2048, offsamples=4)
     for part in ElementTree.parse(folder / "assets.xml").getroot():
         if part.tag in ("asset", "default"):
             root.append(part)
