@@ -27,6 +27,7 @@ import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
 
@@ -39,7 +40,6 @@ SAMPLES_PER_COMPONENT = 8
 FAR = 1e8
 """Farther than this from the goal, in the farthest component's distance, the weights are those of
 the same direction at this distance, where they have long settled; their squares would overflow."""
-
 
 PRIORS_TOLERANCE = 1e-6
 """How far from 1 a file's priors may sum."""
@@ -325,11 +325,6 @@ def expectation_maximisation(
         # still give a mixture: the scores tell how good a field it is.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return mixture.fit(samples)
-
-
-def evenly(samples: FloatArray, n: int) -> FloatArray:
-    """Return every k-th sample, at most about n of them."""
-    return samples[:: max(1, round(len(samples) / n))]
 
 
 class GMR(DynamicalSystem):

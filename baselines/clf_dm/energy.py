@@ -159,26 +159,31 @@ def objective(
     weight : float
         w: psi² counts where psi > 0, -w psi² where V descends.
     """
+    n, d = len(x), form.n_dims
     roots, centres = form.roots_and_centres(vector)
     energy = form.energy(vector)
-    products, brackets = energy._brackets(x)
-    inner = 2.0 * products - energy._shifts
-    weights = 2.0 * brackets
-    weights[:, 0] = 1.0
-    gradient = (weights[:, None] @ inner)[:, 0]
-    norms = np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    # Samples are columns here: sums over the few terms and dimensions then run along memory.
+    x, directions = x.T, directions.T
+    shifts = energy._shifts[:, :, None]
+    products = (energy.matrices.reshape(-1, d) @ x).reshape(-1, d, n)
+    brackets = (products * x).sum(axis=1) - energy._shifts @ x
+    inner = 2.0 * products - shifts
+    weights = 2.0 * np.maximum(brackets, 0.0)
+    weights[0] = 1.0
+    gradient = (weights[:, None] * inner).sum(axis=0)
+    norms = np.maximum(np.sqrt((gradient**2).sum(axis=0)), np.finfo(np.float64).tiny)
     unit = gradient / norms
-    psi = (unit * directions).sum(axis=1, keepdims=True)
+    psi = (unit * directions).sum(axis=0)
     signed = np.where(psi > 0, 1.0, -weight)
     value = float(np.mean(signed * psi**2))
     # d psi = (v - psi g) · dg / |g|, g the unit gradient.
-    pull = 2.0 * signed * psi * (directions - psi * unit) / (norms * len(x))
+    pull = (2.0 * signed * psi / (norms * n)) * (directions - psi * unit)
     # g = sum_l w_l (2 P_l x - P_l mu_l), w_l = 2 max(q_l, 0), q_l = xᵀ P_l (x - mu_l).
-    along = 2.0 * (inner @ pull[:, :, None])[:, :, 0] * (brackets > 0)
-    along[:, 0] = 0.0
-    of_products = 2.0 * weights[:, :, None] * pull[:, None] + along[:, :, None] * x[:, None]
-    of_matrices = (of_products.reshape(len(x), -1).T @ x).reshape(roots.shape)
-    of_shifts = -(weights.T @ pull) - along.T @ x
+    along = 2.0 * (inner * pull).sum(axis=1) * (brackets > 0)
+    along[0] = 0.0
+    of_products = 2.0 * weights[:, None] * pull + along[:, None] * x
+    of_matrices = (of_products.reshape(-1, n) @ x.T).reshape(roots.shape)
+    of_shifts = -(weights @ pull.T) - along @ x.T
     of_centres = np.einsum("lij,lj->li", energy.matrices[1:], of_shifts[1:])
     of_matrices[1:] += of_shifts[1:, :, None] * centres[:, None]
     of_roots = (of_matrices + np.swapaxes(of_matrices, 1, 2)) @ roots
@@ -242,6 +247,7 @@ def learn_energy(
     speeds, distances = np.linalg.norm(v, axis=1), np.linalg.norm(x, axis=1)
     moving = (speeds > LEAST_SPEED * speeds.max()) & (distances > 1e-9 * distances.max())
     x, directions = x[moving], v[moving] / speeds[moving, None]
+    x, directions = np.asfortranarray(x), np.asfortranarray(directions)  # `objective` takes columns
 
     def search(vector: FloatArray, form: EnergyForm, iterations: int) -> tuple[float, FloatArray]:
         result = minimize(

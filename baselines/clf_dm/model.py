@@ -38,7 +38,8 @@ import numpy as np
 from iflow_gym.baselines.clf_dm.config import CLFDMConfig
 from iflow_gym.baselines.clf_dm.energy import Energy, learn_energy
 from iflow_gym.baselines.clf_dm.regressors import CLASSES, Regressor, fit_regressors
-from iflow_gym.baselines.gmr import evenly, scaled_samples
+from iflow_gym.baselines.gmr import scaled_samples
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.metrics import frechet
 from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
@@ -46,8 +47,9 @@ from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
 REPRODUCTION_STEPS = 250
 """About so many steps has a reproduction when regressors and V are chosen among."""
 
-FINALISTS = 3
-"""Regressors that are tried with every V."""
+FINALISTS = (4, 3)
+FULL = 5
+CH = 1
 
 PREFIX = "regressor."
 """Before the names of the regressor's arrays in a file."""
@@ -95,36 +97,56 @@ class CLFDM(DynamicalSystem):
         energies = [
             energy
             for weight in config.weights
+            for i in range(CH)
             for energy in learn_energy(
                 few[:, :d], few[:, d:], config.max_terms, config.least_gain, weight, rng
-            )
+            )[min(i,1):]
         ]
         scales = float(scale[0]), float(scale[0] / scale[-1])
 
-        def error(energy: Energy, regressor: Regressor) -> float:
-            self._adopt(energy, regressor, *scales, goal)
-            return self._reproduction_error(demonstrations)
+        def error(pair: tuple[Energy, Regressor], every: int) -> float:
+            self._adopt(*pair, *scales, goal)
+            return self._reproduction_error(demonstrations, every)
 
-        if len(regressors) * len(energies) > 1:
-            # All regressors with the last V, then the best of them with every V.
-            regressors.sort(key=lambda regressor: error(energies[-1], regressor))
-            pairs = list(itertools.product(energies[::-1], regressors[:FINALISTS]))
-            pairs.sort(key=lambda pair: error(*pair))
-        else:
-            pairs = [(energies[0], regressors[0])]
-        self._adopt(*pairs[0], *scales, goal)
+        pair = self._best_pair(energies, regressors, demonstrations, error)
+        self._adopt(*pair, *scales, goal)
 
-    def _reproduction_error(self, demonstrations: Demonstrations) -> float:
-        """Return the mean Fréchet distance of thinned reproductions to the demonstrations."""
+    def _best_pair(self, energies, regressors, demonstrations, error):
+        """Return V and the regressor that reproduce the fitted demonstrations best.
+
+        All regressors are tried with one V, all V with the best of them, the best of both with each
+        other, and the best pairs at the demonstrations' own sample time.
+        """
         longest = max(len(p) for p in demonstrations.positions)
-        every = max(1, round(longest / REPRODUCTION_STEPS))
+        coarse = max(1, round(longest / REPRODUCTION_STEPS))
+        errors = {}
+
+        def tried(pairs):
+            for pair in pairs:
+                if pair not in errors:
+                    errors[pair] = error(pair, coarse)
+            return sorted(pairs, key=errors.__getitem__)
+
+        by_regressor = tried([(energies[-1], r) for r in regressors])[:FINALISTS[1]]
+        by_energy = tried([(e, by_regressor[0][1]) for e in energies])[:FINALISTS[0]]
+        tried([(e, r) for e, _ in by_energy for _, r in by_regressor])
+        last = sorted(errors, key=errors.__getitem__)[:FULL]
+        return min(last, key=lambda pair: error(pair, 1))
+
+    def _reproduction_error(self, demonstrations: Demonstrations, every: int) -> float:
+        """Return the mean Fréchet distance of reproductions to the demonstrations.
+
+        Steps are `every` samples long; distances are taken between about REPRODUCTION_STEPS samples.
+        """
+        longest = max(len(p) for p in demonstrations.positions)
         dt = np.array(demonstrations.dt) * every
         paths = [demonstrations.starts]
         for _ in range((longest - 1) // every):
             paths.append(self._step(paths[-1], dt))
         made = np.stack(paths, axis=1)
-        shown = [p[::every] for p in demonstrations.positions]
-        pairs = [(p, path[: len(p)]) for p, path in zip(shown, made, strict=True)]
+        thin = max(1, round(longest / REPRODUCTION_STEPS / every))
+        shown = [p[::every][::thin] for p in demonstrations.positions]
+        pairs = [(p, path[::thin][: len(p)]) for p, path in zip(shown, made, strict=True)]
         return float(np.mean([frechet(p, q) for p, q in pairs]))
 
     def _adopt(

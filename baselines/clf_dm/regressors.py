@@ -30,10 +30,10 @@ from iflow_gym.baselines.gmr import (
     MixtureField,
     checked_mixture,
     choose_components,
-    evenly,
     fit_mixture,
     scaled_samples,
 )
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import FloatArray
 
 SVR_TUBE = 0.02
