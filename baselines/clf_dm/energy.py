@@ -12,6 +12,7 @@ not be more than symmetric: an asymmetric one is a symmetric one with another mu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -211,6 +212,25 @@ def _start(
     if fresh:
         roots, centres = roots[:1], centres[:0]
     return wider.flattened(np.concatenate([roots, shapes]), np.concatenate([centres, where]))
+
+
+def learn_energies(
+    x: FloatArray,
+    v: FloatArray,
+    weights: Sequence[float],
+    n_searches: int,
+    max_terms: int,
+    least_gain: float,
+    rng: np.random.Generator,
+) -> list[Energy]:
+    """Learn V for every w, `n_searches` times each: all those of `learn_energy`, none twice."""
+    found: list[Energy] = []
+    for weight in weights:
+        for i in range(n_searches):
+            energies = learn_energy(x, v, max_terms, least_gain, weight, rng)
+            # Without asymmetric terms nothing is drawn: the first is the same in every search.
+            found += energies[min(i, 1) :]
+    return found
 
 
 def learn_energy(
