@@ -18,7 +18,7 @@ class CLFDMConfig:
     or support vector machines."""
     n_components: int | None = None
     """Gaussians of the mixture; None tries the number of least BIC, and four and eight more."""
-    n_initialisations: int = 4
+    n_initialisations: int = 2
     """Mixtures, from different starts of EM, that are tried for each number of Gaussians."""
     kernel_samples: int = 400
     """Samples, evenly taken, that a Gaussian process or support vector machine is fitted on."""

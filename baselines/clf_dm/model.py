@@ -83,7 +83,8 @@ class CLFDM(DynamicalSystem):
         config, goal = self.config, demonstrations.attractor
         x = np.concatenate(demonstrations.positions) - goal
         v = np.concatenate(demonstrations.velocities)
-        regressors = fit_regressors(x, v, config, rng)
+        phases = np.concatenate([np.linspace(0, 1, len(p)) for p in demonstrations.positions])
+        regressors = fit_regressors(x, v, phases, config, rng)
         both, scale = scaled_samples(x, v)
         few = evenly(both, config.energy_samples)
         d = x.shape[1]

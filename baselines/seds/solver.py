@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from sklearn.mixture import GaussianMixture
 
 from iflow_gym.baselines.gmr import (
+    check_components,
     expectation_maximisation,
     numbers_of_components,
     scaled_samples,
@@ -61,10 +62,7 @@ def fit_stable_mixture(
     n_components = config.n_components
     if n_components is None:
         n_components = choose_components(evenly(both, config.selection_samples), config, seeds[0])
-    elif n_components > len(both):
-        raise ValueError(
-            f"Expected at most as many Gaussians as samples, {len(both)}, got {n_components}."
-        )
+    check_components(n_components, len(both))
     chosen = evenly(both, max(config.fit_samples, n_components))
     samples = Samples.of(chosen[:, :d], chosen[:, d:])
     form = Parametrisation(n_components, d, config.margin)
