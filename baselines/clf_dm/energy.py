@@ -59,8 +59,7 @@ class Energy:
         n, d = matrices.shape[:2]
         self._shape = (-1, n, d)
         self._stacked = matrices.reshape(-1, d).T.copy()
-        self._shifts = np.zeros((n, d))  # P_l mu_l
-        self._shifts[1:] = np.einsum("lij,lj->li", matrices[1:], centres)
+        self._shifts = shifted(matrices, centres)
 
     def _brackets(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return P_l x, shape (n, L + 1, d), and the brackets where they count, (n, L + 1)."""
@@ -105,6 +104,13 @@ class Energy:
         return np.asarray(s[:, None] * x)
 
 
+def shifted(matrices: FloatArray, centres: FloatArray) -> FloatArray:
+    """Return P_l mu_l, shape (L + 1, d), with 0 for the first, which has no mu."""
+    shifts = np.zeros(matrices.shape[:2])
+    shifts[1:] = (matrices[1:] @ centres[:, :, None])[:, :, 0]
+    return shifts
+
+
 @dataclass(frozen=True)
 class EnergyForm:
     """Between V and a vector: mu_l, and lower triangular T_l, P_l = T_l T_lᵀ + a tr(T_l T_lᵀ) I."""
@@ -131,12 +137,17 @@ class EnergyForm:
         roots[:, rows, columns] = vector[n * d :].reshape(n + 1, -1)
         return roots, vector[: n * d].reshape(n, d)
 
+    def matrices(self, roots: FloatArray) -> FloatArray:
+        """Return P, shape (L + 1, d, d)."""
+        matrices = roots @ np.swapaxes(roots, 1, 2)
+        least = LEAST_SHARE * np.einsum("lii->l", matrices)
+        matrices[:, range(self.n_dims), range(self.n_dims)] += least[:, None]
+        return matrices
+
     def energy(self, vector: FloatArray) -> Energy:
         """Return V."""
         roots, centres = self.roots_and_centres(vector)
-        traces = (roots**2).sum(axis=(1, 2))[:, None, None]
-        least = LEAST_SHARE * traces * np.eye(self.n_dims)
-        return Energy(roots @ np.swapaxes(roots, 1, 2) + least, centres)
+        return Energy(self.matrices(roots), centres)
 
     def flattened(self, roots: FloatArray, centres: FloatArray) -> FloatArray:
         """Return the vector of T and mu, or of a gradient with respect to them."""
@@ -162,13 +173,13 @@ def objective(
     """
     n, d = len(x), form.n_dims
     roots, centres = form.roots_and_centres(vector)
-    energy = form.energy(vector)
+    matrices = form.matrices(roots)
+    shifts = shifted(matrices, centres)
     # Samples are columns here: sums over the few terms and dimensions then run along memory.
     x, directions = x.T, directions.T
-    shifts = energy._shifts[:, :, None]
-    products = (energy.matrices.reshape(-1, d) @ x).reshape(-1, d, n)
-    brackets = (products * x).sum(axis=1) - energy._shifts @ x
-    inner = 2.0 * products - shifts
+    products = (matrices.reshape(-1, d) @ x).reshape(-1, d, n)
+    brackets = (products * x).sum(axis=1) - shifts @ x
+    inner = 2.0 * products - shifts[:, :, None]
     weights = 2.0 * np.maximum(brackets, 0.0)
     weights[0] = 1.0
     gradient = (weights[:, None] * inner).sum(axis=0)
@@ -185,7 +196,7 @@ def objective(
     of_products = 2.0 * weights[:, None] * pull + along[:, None] * x
     of_matrices = (of_products.reshape(-1, n) @ x.T).reshape(roots.shape)
     of_shifts = -(weights @ pull.T) - along @ x.T
-    of_centres = np.einsum("lij,lj->li", energy.matrices[1:], of_shifts[1:])
+    of_centres = (matrices[1:] @ of_shifts[1:, :, None])[:, :, 0]
     of_matrices[1:] += of_shifts[1:, :, None] * centres[:, None]
     of_roots = (of_matrices + np.swapaxes(of_matrices, 1, 2)) @ roots
     of_roots += 2.0 * LEAST_SHARE * np.einsum("lii->l", of_matrices)[:, None, None] * roots

@@ -27,7 +27,7 @@ COMPARED = 125, 250
 REGRESSORS, ENERGIES = 4, 3
 """How many of the best are tried with each other."""
 
-FINALISTS = 8
+FINALISTS = 6
 """Pairs that are tried at the demonstrations' own sample times."""
 
 
