@@ -24,9 +24,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
 
@@ -39,7 +41,6 @@ SAMPLES_PER_COMPONENT = 8
 FAR = 1e8
 """Farther than this from the goal, in the farthest component's distance, the weights are those of
 the same direction at this distance, where they have long settled; their squares would overflow."""
-
 
 PRIORS_TOLERANCE = 1e-6
 """How far from 1 a file's priors may sum."""
@@ -238,14 +239,26 @@ def fit_mixture(
     n_components = config.n_components
     if n_components is None:
         n_components = choose_components(samples, config, seed)
-    elif n_components > len(samples):
-        raise ValueError(
-            f"Expected at most as many Gaussians as samples, {len(samples)}, got {n_components}."
-        )
+    check_components(n_components, len(samples))
     chosen = evenly(samples, max(config.fit_samples, n_components))
     mixture = expectation_maximisation(
         chosen, n_components, config.n_initialisations, config.regularisation, seed
     )
+    return in_units(mixture, scale)
+
+
+def check_components(n_components: int, n_samples: int) -> None:
+    """Raise ValueError if there are more Gaussians than samples."""
+    if n_components > n_samples:
+        raise ValueError(
+            f"Expected at most as many Gaussians as samples, {n_samples}, got {n_components}."
+        )
+
+
+def in_units(
+    mixture: GaussianMixture, scale: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return priors, means and covariances of a mixture of `scaled_samples`, scaled back."""
     return mixture.weights_, mixture.means_ * scale, mixture.covariances_ * np.outer(scale, scale)
 
 
@@ -310,9 +323,18 @@ def numbers_of_components(n_samples: int) -> range:
 
 
 def expectation_maximisation(
-    samples: FloatArray, n_components: int, n_init: int, regularisation: float, seed: int
+    samples: FloatArray,
+    n_components: int,
+    n_init: int,
+    regularisation: float,
+    seed: int,
+    labels: NDArray[np.int_] | None = None,
 ) -> GaussianMixture:
-    """Return the likeliest mixture of EM from `n_init` starts by k-means."""
+    """Return the likeliest mixture of EM from `n_init` starts by k-means.
+
+    With labels, one a sample from 0 to `n_components` - 1 and none of them unused, EM starts from
+    the Gaussians of the samples that share one.
+    """
     mixture = GaussianMixture(
         n_components,
         n_init=n_init,
@@ -320,16 +342,22 @@ def expectation_maximisation(
         random_state=seed,
         max_iter=200,
     )
+    if labels is not None:
+        d = samples.shape[1]
+        groups = [samples[labels == k] for k in range(n_components)]
+        around = [g - g.mean(axis=0) for g in groups]
+        spreads = [a.T @ a / len(a) + regularisation * np.eye(d) for a in around]
+        mixture.set_params(
+            n_init=1,
+            weights_init=np.array([len(g) for g in groups]) / len(samples),
+            means_init=np.array([g.mean(axis=0) for g in groups]),
+            precisions_init=np.linalg.inv(spreads),
+        )
     with warnings.catch_warnings():
         # EM that still gains a little, and recordings with fewer distinct samples than Gaussians,
         # still give a mixture: the scores tell how good a field it is.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return mixture.fit(samples)
-
-
-def evenly(samples: FloatArray, n: int) -> FloatArray:
-    """Return every k-th sample, at most about n of them."""
-    return samples[:: max(1, round(len(samples) / n))]
 
 
 class GMR(DynamicalSystem):

@@ -18,7 +18,7 @@ class CLFDMConfig:
     or support vector machines."""
     n_components: int | None = None
     """Gaussians of the mixture; None tries the number of least BIC, and four and eight more."""
-    n_initialisations: int = 4
+    n_initialisations: int = 2
     """Mixtures, from different starts of EM, that are tried for each number of Gaussians."""
     kernel_samples: int = 400
     """Samples, evenly taken, that a Gaussian process or support vector machine is fitted on."""
@@ -32,6 +32,8 @@ class CLFDMConfig:
     """Values of w, what steeper descent along the demonstrations is worth beside a violation; all
     are tried. The authors' 1e-4 leaves V so flat along the demonstrations that more is corrected
     beside them; with much more of it violations are bought."""
+    n_searches: int = 2
+    """Searches for V, from different starts, for each w."""
     energy_samples: int = 700
     """Samples, evenly taken, that V is learned from."""
     rho: RhoForm = "code"
@@ -52,6 +54,7 @@ class CLFDMConfig:
             raise ValueError(f"Expected n_components >= 1 or None, got {self.n_components}.")
         for name, least in (
             ("n_initialisations", 1),
+            ("n_searches", 1),
             ("kernel_samples", 1),
             ("energy_samples", 1),
             ("max_terms", 0),

@@ -12,6 +12,7 @@ not be more than symmetric: an asymmetric one is a symmetric one with another mu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,8 +59,7 @@ class Energy:
         n, d = matrices.shape[:2]
         self._shape = (-1, n, d)
         self._stacked = matrices.reshape(-1, d).T.copy()
-        self._shifts = np.zeros((n, d))  # P_l mu_l
-        self._shifts[1:] = np.einsum("lij,lj->li", matrices[1:], centres)
+        self._shifts = shifted(matrices, centres)
 
     def _brackets(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return P_l x, shape (n, L + 1, d), and the brackets where they count, (n, L + 1)."""
@@ -104,6 +104,13 @@ class Energy:
         return np.asarray(s[:, None] * x)
 
 
+def shifted(matrices: FloatArray, centres: FloatArray) -> FloatArray:
+    """Return P_l mu_l, shape (L + 1, d), with 0 for the first, which has no mu."""
+    shifts = np.zeros(matrices.shape[:2])
+    shifts[1:] = (matrices[1:] @ centres[:, :, None])[:, :, 0]
+    return shifts
+
+
 @dataclass(frozen=True)
 class EnergyForm:
     """Between V and a vector: mu_l, and lower triangular T_l, P_l = T_l T_lᵀ + a tr(T_l T_lᵀ) I."""
@@ -130,12 +137,17 @@ class EnergyForm:
         roots[:, rows, columns] = vector[n * d :].reshape(n + 1, -1)
         return roots, vector[: n * d].reshape(n, d)
 
+    def matrices(self, roots: FloatArray) -> FloatArray:
+        """Return P, shape (L + 1, d, d)."""
+        matrices = roots @ np.swapaxes(roots, 1, 2)
+        least = LEAST_SHARE * np.einsum("lii->l", matrices)
+        matrices[:, range(self.n_dims), range(self.n_dims)] += least[:, None]
+        return matrices
+
     def energy(self, vector: FloatArray) -> Energy:
         """Return V."""
         roots, centres = self.roots_and_centres(vector)
-        traces = (roots**2).sum(axis=(1, 2))[:, None, None]
-        least = LEAST_SHARE * traces * np.eye(self.n_dims)
-        return Energy(roots @ np.swapaxes(roots, 1, 2) + least, centres)
+        return Energy(self.matrices(roots), centres)
 
     def flattened(self, roots: FloatArray, centres: FloatArray) -> FloatArray:
         """Return the vector of T and mu, or of a gradient with respect to them."""
@@ -159,27 +171,32 @@ def objective(
     weight : float
         w: psi² counts where psi > 0, -w psi² where V descends.
     """
+    n, d = len(x), form.n_dims
     roots, centres = form.roots_and_centres(vector)
-    energy = form.energy(vector)
-    products, brackets = energy._brackets(x)
-    inner = 2.0 * products - energy._shifts
-    weights = 2.0 * brackets
-    weights[:, 0] = 1.0
-    gradient = (weights[:, None] @ inner)[:, 0]
-    norms = np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    matrices = form.matrices(roots)
+    shifts = shifted(matrices, centres)
+    # Samples are columns here: sums over the few terms and dimensions then run along memory.
+    x, directions = x.T, directions.T
+    products = (matrices.reshape(-1, d) @ x).reshape(-1, d, n)
+    brackets = (products * x).sum(axis=1) - shifts @ x
+    inner = 2.0 * products - shifts[:, :, None]
+    weights = 2.0 * np.maximum(brackets, 0.0)
+    weights[0] = 1.0
+    gradient = (weights[:, None] * inner).sum(axis=0)
+    norms = np.maximum(np.sqrt((gradient**2).sum(axis=0)), np.finfo(np.float64).tiny)
     unit = gradient / norms
-    psi = (unit * directions).sum(axis=1, keepdims=True)
+    psi = (unit * directions).sum(axis=0)
     signed = np.where(psi > 0, 1.0, -weight)
     value = float(np.mean(signed * psi**2))
     # d psi = (v - psi g) · dg / |g|, g the unit gradient.
-    pull = 2.0 * signed * psi * (directions - psi * unit) / (norms * len(x))
+    pull = (2.0 * signed * psi / (norms * n)) * (directions - psi * unit)
     # g = sum_l w_l (2 P_l x - P_l mu_l), w_l = 2 max(q_l, 0), q_l = xᵀ P_l (x - mu_l).
-    along = 2.0 * (inner @ pull[:, :, None])[:, :, 0] * (brackets > 0)
-    along[:, 0] = 0.0
-    of_products = 2.0 * weights[:, :, None] * pull[:, None] + along[:, :, None] * x[:, None]
-    of_matrices = (of_products.reshape(len(x), -1).T @ x).reshape(roots.shape)
-    of_shifts = -(weights.T @ pull) - along.T @ x
-    of_centres = np.einsum("lij,lj->li", energy.matrices[1:], of_shifts[1:])
+    along = 2.0 * (inner * pull).sum(axis=1) * (brackets > 0)
+    along[0] = 0.0
+    of_products = 2.0 * weights[:, None] * pull + along[:, None] * x
+    of_matrices = (of_products.reshape(-1, n) @ x.T).reshape(roots.shape)
+    of_shifts = -(weights @ pull.T) - along @ x.T
+    of_centres = (matrices[1:] @ of_shifts[1:, :, None])[:, :, 0]
     of_matrices[1:] += of_shifts[1:, :, None] * centres[:, None]
     of_roots = (of_matrices + np.swapaxes(of_matrices, 1, 2)) @ roots
     of_roots += 2.0 * LEAST_SHARE * np.einsum("lii->l", of_matrices)[:, None, None] * roots
@@ -206,6 +223,25 @@ def _start(
     if fresh:
         roots, centres = roots[:1], centres[:0]
     return wider.flattened(np.concatenate([roots, shapes]), np.concatenate([centres, where]))
+
+
+def learn_energies(
+    x: FloatArray,
+    v: FloatArray,
+    weights: Sequence[float],
+    n_searches: int,
+    max_terms: int,
+    least_gain: float,
+    rng: np.random.Generator,
+) -> list[Energy]:
+    """Learn V for every w, `n_searches` times each: all those of `learn_energy`, none twice."""
+    found: list[Energy] = []
+    for weight in weights:
+        for i in range(n_searches):
+            energies = learn_energy(x, v, max_terms, least_gain, weight, rng)
+            # Without asymmetric terms nothing is drawn: the first is the same in every search.
+            found += energies[min(i, 1) :]
+    return found
 
 
 def learn_energy(
@@ -242,6 +278,7 @@ def learn_energy(
     speeds, distances = np.linalg.norm(v, axis=1), np.linalg.norm(x, axis=1)
     moving = (speeds > LEAST_SPEED * speeds.max()) & (distances > 1e-9 * distances.max())
     x, directions = x[moving], v[moving] / speeds[moving, None]
+    x, directions = np.asfortranarray(x), np.asfortranarray(directions)  # `objective` takes columns
 
     def search(vector: FloatArray, form: EnergyForm, iterations: int) -> tuple[float, FloatArray]:
         result = minimize(

@@ -29,25 +29,20 @@ Deviations from the paper:
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 
 from iflow_gym.baselines.clf_dm.config import CLFDMConfig
-from iflow_gym.baselines.clf_dm.energy import Energy, learn_energy
+from iflow_gym.baselines.clf_dm.controller import Controller
+from iflow_gym.baselines.clf_dm.energy import Energy, learn_energies
 from iflow_gym.baselines.clf_dm.regressors import CLASSES, Regressor, fit_regressors
-from iflow_gym.baselines.gmr import evenly, scaled_samples
+from iflow_gym.baselines.clf_dm.selection import best_controller
+from iflow_gym.baselines.gmr import scaled_samples
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.metrics import frechet
 from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
-
-REPRODUCTION_STEPS = 250
-"""About so many steps has a reproduction when regressors and V are chosen among."""
-
-FINALISTS = 3
-"""Regressors that are tried with every V."""
 
 PREFIX = "regressor."
 """Before the names of the regressor's arrays in a file."""
@@ -88,97 +83,56 @@ class CLFDM(DynamicalSystem):
         config, goal = self.config, demonstrations.attractor
         x = np.concatenate(demonstrations.positions) - goal
         v = np.concatenate(demonstrations.velocities)
-        regressors = fit_regressors(x, v, config, rng)
+        phases = np.concatenate([np.linspace(0, 1, len(p)) for p in demonstrations.positions])
+        regressors = fit_regressors(x, v, phases, config, rng)
         both, scale = scaled_samples(x, v)
         few = evenly(both, config.energy_samples)
         d = x.shape[1]
-        energies = [
-            energy
-            for weight in config.weights
-            for energy in learn_energy(
-                few[:, :d], few[:, d:], config.max_terms, config.least_gain, weight, rng
-            )
-        ]
-        scales = float(scale[0]), float(scale[0] / scale[-1])
+        energies = learn_energies(
+            few[:, :d],
+            few[:, d:],
+            config.weights,
+            config.n_searches,
+            config.max_terms,
+            config.least_gain,
+            rng,
+        )
+        length, time = float(scale[0]), float(scale[0] / scale[-1])
 
-        def error(energy: Energy, regressor: Regressor) -> float:
-            self._adopt(energy, regressor, *scales, goal)
-            return self._reproduction_error(demonstrations)
+        def controller(energy: Energy, regressor: Regressor) -> Controller:
+            return self._controller(energy, regressor, length, time)
 
-        if len(regressors) * len(energies) > 1:
-            # All regressors with the last V, then the best of them with every V.
-            regressors.sort(key=lambda regressor: error(energies[-1], regressor))
-            pairs = list(itertools.product(energies[::-1], regressors[:FINALISTS]))
-            pairs.sort(key=lambda pair: error(*pair))
-        else:
-            pairs = [(energies[0], regressors[0])]
-        self._adopt(*pairs[0], *scales, goal)
+        positions = [(p - goal) / length for p in demonstrations.positions]
+        times = np.array(demonstrations.dt) / time
+        self._adopt(best_controller(energies, regressors, controller, positions, times), goal)
 
-    def _reproduction_error(self, demonstrations: Demonstrations) -> float:
-        """Return the mean Fréchet distance of thinned reproductions to the demonstrations."""
-        longest = max(len(p) for p in demonstrations.positions)
-        every = max(1, round(longest / REPRODUCTION_STEPS))
-        dt = np.array(demonstrations.dt) * every
-        paths = [demonstrations.starts]
-        for _ in range((longest - 1) // every):
-            paths.append(self._step(paths[-1], dt))
-        made = np.stack(paths, axis=1)
-        shown = [p[::every] for p in demonstrations.positions]
-        pairs = [(p, path[: len(p)]) for p, path in zip(shown, made, strict=True)]
-        return float(np.mean([frechet(p, q) for p, q in pairs]))
+    def _controller(
+        self, energy: Energy, regressor: Regressor, length: float, time: float
+    ) -> Controller:
+        config = self.config
+        return Controller(energy, regressor, length, time, config.rho, config.rho0, config.kappa0)
 
-    def _adopt(
-        self,
-        energy: Energy,
-        regressor: Regressor,
-        length: float,
-        time: float,
-        goal: FloatArray,
-    ) -> None:
-        self.energy_, self.regressor_ = energy, regressor
-        self.length_, self.time_ = length, time
-        self._goal = goal
+    def _adopt(self, controller: Controller, goal: FloatArray) -> None:
+        self.controller_, self._goal = controller, goal
+        self.energy_, self.regressor_ = controller.energy, controller.regressor
+        self.length_, self.time_ = controller.length, controller.time
 
-    # The controller -----------------------------------------------------------------------
-
-    def _corrected(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return f, V, rho and the gradient of V, in units of length_ and time_, x likewise."""
-        raw = self.regressor_.velocity(x * self.length_) * (self.time_ / self.length_)
-        value, gradient = self.energy_.value_and_gradient(x)
-        square = (gradient * gradient).sum(axis=1)
-        distance = (x * x).sum(axis=1)
-        kappa = self.config.kappa0
-        if self.config.rho == "paper":
-            rho = -self.config.rho0 * np.expm1(-kappa * np.sqrt(distance))
-        else:
-            rho = -self.config.rho0 * np.expm1(-kappa * distance) * np.sqrt(square)
-        excess = np.maximum((gradient * raw).sum(axis=1) + rho, 0.0)
-        moving = square > 0
-        pull = np.where(moving, excess / np.where(moving, square, 1.0), 0.0)
-        velocity = np.where(moving[:, None], raw - pull[:, None] * gradient, 0.0)
-        return velocity, value, rho, gradient
+    def _offsets(self, x: FloatArray) -> FloatArray:
+        return (x - self._goal) / self.length_
 
     def _velocity(self, x: FloatArray) -> FloatArray:
-        velocity, _, _, _ = self._corrected((x - self._goal) / self.length_)
+        velocity, _, _, _ = self.controller_.corrected(self._offsets(x))
         return velocity * (self.length_ / self.time_)
 
     def _step(self, x: FloatArray, dt: FloatArray) -> FloatArray:
-        offset = (x - self._goal) / self.length_
-        steps = dt / self.time_
-        velocity, value, rho, _ = self._corrected(offset)
-        after = offset + steps[:, None] * velocity
-        safe = np.where(value > 0, value, 1.0)
-        level = value * np.exp(-rho * steps / safe)
-        above = np.flatnonzero(self.energy_.value(after) > level)
-        if len(above):
-            after[above] = self.energy_.pulled_back(after[above], level[above])
+        after = self.controller_.step(self._offsets(x), dt / self.time_)
         return np.asarray(self._goal + self.length_ * after)
 
     def _lyapunov(self, x: FloatArray) -> FloatArray:
-        return self.energy_.value((x - self._goal) / self.length_)
+        return self.energy_.value(self._offsets(x))
 
     def _lyapunov_rate(self, x: FloatArray) -> FloatArray:
-        velocity, _, _, gradient = self._corrected((x - self._goal) / self.length_)
+        velocity, _, _, gradient = self.controller_.corrected(self._offsets(x))
         return np.asarray((gradient * velocity).sum(axis=1) / self.time_)
 
     @property
@@ -222,6 +176,7 @@ class CLFDM(DynamicalSystem):
             raise ValueError(f"expected scales of length and time > 0, got {scales}")
         own = {k.removeprefix(PREFIX): a for k, a in arrays.items() if k.startswith(PREFIX)}
         regressor = CLASSES[self.config.regressor].of_arrays(own, d)
+        length, time = scales.tolist()
         self._adopt(
-            Energy(matrices, centres), regressor, float(scales[0]), float(scales[1]), self.goal_
+            self._controller(Energy(matrices, centres), regressor, length, time), self.goal_
         )

@@ -12,15 +12,11 @@ being fitted to what is beyond it.
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from scipy.spatial.distance import cdist
 from sklearn.svm import SVR
 
 from iflow_gym.baselines.clf_dm.config import CLFDMConfig
@@ -28,12 +24,15 @@ from iflow_gym.baselines.gmr import (
     SAMPLES_PER_COMPONENT,
     GMRConfig,
     MixtureField,
+    check_components,
     checked_mixture,
     choose_components,
-    evenly,
-    fit_mixture,
+    expectation_maximisation,
+    in_units,
     scaled_samples,
 )
+from iflow_gym.baselines.gpr import maximise_likelihood
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import FloatArray
 
 SVR_TUBE = 0.02
@@ -41,10 +40,6 @@ SVR_TUBE = 0.02
 
 SVR_COSTS, SVR_LENGTHS = (10.0, 1000.0), (0.25, 0.5, 1.0)
 """C, and the kernel's length in the same units: all pairs are tried."""
-
-GPR_LENGTHS, GPR_NOISES = (0.05, 5.0), (1e-6, 1.0)
-"""Bounds of the length scale and of the noise's variance, in the same units."""
-
 
 HOMING = 1.0
 """Rate at which a state far from the samples nears the goal, in root mean square speeds a root mean
@@ -86,7 +81,7 @@ class MixtureRegressor:
 
 
 class KernelRegressor:
-    """v(x) = bias - rate x + sum_i w_i exp(-‖x - x_i‖² / (2 length²)).
+    """v(x) = bias - rate x + sum_i w_i exp(-‖(x - x_i) / lengths‖² / 2).
 
     Parameters
     ----------
@@ -94,7 +89,9 @@ class KernelRegressor:
     weights : array, shape (m, d)
         In units of velocity.
     bias : array, shape (d,)
-    length, rate : arrays, shape (1,)
+    lengths : array, shape (d,)
+        Of the kernel, along each axis.
+    rate : array, shape (1,)
     """
 
     def __init__(
@@ -102,7 +99,7 @@ class KernelRegressor:
         points: FloatArray,
         weights: FloatArray,
         bias: FloatArray,
-        length: FloatArray,
+        lengths: FloatArray,
         rate: FloatArray,
     ) -> None:
         weights = np.ascontiguousarray(weights)  # the layout decides how a product rounds
@@ -110,33 +107,33 @@ class KernelRegressor:
             "points": points,
             "weights": weights,
             "bias": bias,
-            "length": length,
+            "lengths": lengths,
             "rate": rate,
         }
-        # -‖x - x_i‖² / 2 = x · x_i - ‖x_i‖² / 2 - ‖x‖² / 2, with lengths in `length`.
-        self._points = (points / length).T.copy()
+        # -‖x - x_i‖² / 2 = x · x_i - ‖x_i‖² / 2 - ‖x‖² / 2, with x over `lengths`.
+        self._points = (points / lengths).T.copy()
         self._halves = 0.5 * (self._points**2).sum(axis=0)
         self._weights, self._bias = weights, bias
-        self._length, self._rate = float(length[0]), float(rate[0])
+        self._lengths, self._rate = lengths, float(rate[0])
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]], d: int) -> KernelRegressor:
         """Return the regressor of a file's arrays; raise ValueError if they do not fit."""
-        names = ("points", "weights", "bias", "length", "rate")
+        names = ("points", "weights", "bias", "lengths", "rate")
         values = [np.asarray(arrays[name], dtype=np.float64) for name in names]
         m = len(values[0]) if values[0].ndim else 0
-        expected, came = [(m, d), (m, d), (d,), (1,), (1,)], [a.shape for a in values]
+        expected, came = [(m, d), (m, d), (d,), (d,), (1,)], [a.shape for a in values]
         if m < 1 or came != expected:
             raise ValueError(
                 f"expected {', '.join(names)} of shapes {expected} with m >= 1, got {came}"
             )
-        if not values[3][0] > 0:
-            raise ValueError(f"expected a kernel's length > 0, got {values[3][0]}")
+        if not (values[3] > 0).all():
+            raise ValueError(f"expected a kernel's lengths > 0, got {values[3]}")
         return cls(*values)
 
     def velocity(self, x: FloatArray) -> FloatArray:
         """Return v(x)."""
-        near = x / self._length
+        near = x / self._lengths
         kernel = near @ self._points
         kernel -= self._halves
         kernel -= 0.5 * (near * near).sum(axis=1, keepdims=True)
@@ -144,7 +141,7 @@ class KernelRegressor:
         return np.asarray(kernel @ self._weights + (self._bias - self._rate * x))
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Return points, weights, bias, length and rate."""
+        """Return points, weights, bias, lengths and rate."""
         return dict(self._numbers)
 
 
@@ -155,31 +152,35 @@ CLASSES: dict[str, type[MixtureRegressor] | type[KernelRegressor]] = {
 }
 """Name in the settings to the class that makes it of a file's arrays."""
 
-
 MIXTURE_SAMPLES = 2000
 """Samples, evenly taken, that a mixture is fitted on."""
 
-MORE_COMPONENTS = (0, 4, 8)
+MORE_COMPONENTS = (-4, -2, 0, 2, 4, 6, 8)
 """Added to the number of Gaussians that BIC chooses."""
 
 
 def fit_regressors(
-    x: FloatArray, v: FloatArray, config: CLFDMConfig, rng: np.random.Generator
+    x: FloatArray,
+    v: FloatArray,
+    phases: FloatArray,
+    config: CLFDMConfig,
+    rng: np.random.Generator,
 ) -> list[Regressor]:
     """Fit the regressors that the settings ask for to offsets and velocities, shape (n, d) each.
 
     Of a mixture there are several: BIC and the likelihood choose among densities of samples, and
-    say little about which field leads along the demonstrations.
+    say little about which field leads along the demonstrations. `phases`, shape (n,), are the
+    samples' times from 0 at their demonstration's start to 1 at its end.
     """
     if config.regressor == "gmr":
-        return _mixtures(x, v, config, rng)
+        return _mixtures(x, v, phases, config, rng)
     both, scale = scaled_samples(x, v)
     few = evenly(both, config.kernel_samples)
     d = x.shape[1]
     beyond = few[:, d:] + HOMING * few[:, :d]
     rate = np.array([HOMING * scale[-1] / scale[0]])
     found = (
-        [_gaussian_process(few[:, :d], beyond, rng)]
+        [_gaussian_process(few[:, :d], beyond)]
         if config.regressor == "gpr"
         else [
             _support_vectors(few[:, :d], beyond, cost, length)
@@ -191,31 +192,50 @@ def fit_regressors(
             points * scale[0],
             weights * scale[-1],
             bias * scale[-1],
-            np.array([length * scale[0]]),
+            lengths * scale[0],
             rate,
         )
-        for points, weights, bias, length in found
+        for points, weights, bias, lengths in found
     ]
 
 
 def _mixtures(
-    x: FloatArray, v: FloatArray, config: CLFDMConfig, rng: np.random.Generator
+    x: FloatArray,
+    v: FloatArray,
+    phases: FloatArray,
+    config: CLFDMConfig,
+    rng: np.random.Generator,
 ) -> list[Regressor]:
-    """Fit mixtures of several numbers of Gaussians, each from several starts."""
-    settings = GMRConfig(n_initialisations=1, fit_samples=MIXTURE_SAMPLES)
-    numbers: list[int] = []
+    """Fit mixtures of several numbers of Gaussians, each from several starts.
+
+    The first start of EM cuts every demonstration into as many pieces of equal time; the others
+    are by k-means.
+    """
+    settings = GMRConfig()
+    both, scale = scaled_samples(x, v)
     if config.n_components is not None:
         numbers = [config.n_components]
     else:
-        both, _ = scaled_samples(x, v)
         least = choose_components(both, settings, int(rng.integers(2**31)))
         most = max(least, len(both) // SAMPLES_PER_COMPONENT)
-        numbers = [n for more in MORE_COMPONENTS if (n := least + more) <= most]
-    return [
-        MixtureRegressor(*_homing(*fit_mixture(x, v, replace(settings, n_components=n), rng), x, v))
-        for n in numbers
-        for _ in range(config.n_initialisations)
-    ]
+        numbers = [n for more in MORE_COMPONENTS if 1 <= (n := least + more) <= most]
+    found: list[Regressor] = []
+    for n in numbers:
+        check_components(n, len(both))
+        few = evenly(np.column_stack([both, phases]), max(MIXTURE_SAMPLES, n))
+        pieces = np.minimum((few[:, -1] * n).astype(int), n - 1)
+        usable = np.bincount(pieces, minlength=n).min() > 0
+        for i in range(config.n_initialisations):
+            mixture = expectation_maximisation(
+                few[:, :-1],
+                n,
+                1,
+                settings.regularisation,
+                int(rng.integers(2**31)),
+                pieces if usable and i == 0 else None,
+            )
+            found.append(MixtureRegressor(*_homing(*in_units(mixture, scale), x, v)))
+    return found
 
 
 def _homing(
@@ -235,25 +255,19 @@ def _homing(
 
 
 def _gaussian_process(
-    x: FloatArray, v: FloatArray, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Fit one process with a shared isotropic kernel; its hyperparameters by the likelihood."""
-    kernel = ConstantKernel(1.0, (1e-2, 1e2)) * RBF(0.5, GPR_LENGTHS) + WhiteKernel(
-        1e-2, GPR_NOISES
-    )
-    process = GaussianProcessRegressor(kernel, random_state=int(rng.integers(2**31)))
-    with warnings.catch_warnings():
-        # A bound that is reached is as good a hyperparameter as another.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        process.fit(x, v)
-    found = process.kernel_.k1
-    weights = found.k1.constant_value * process.alpha_.reshape(v.shape)
-    return x, weights, np.zeros(v.shape[1]), float(found.k2.length_scale)
+    x: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Fit one process to all coordinates, its hyperparameters by the likelihood, as `GPR` does."""
+    signal, lengths, noise = maximise_likelihood(x, v)
+    scaled = x / lengths
+    gram = signal * np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean")) + noise * np.eye(len(x))
+    weights = signal * np.asarray(np.linalg.solve(gram, v), dtype=np.float64)
+    return x, weights, np.zeros(v.shape[1]), lengths
 
 
 def _support_vectors(
     x: FloatArray, v: FloatArray, cost: float, length: float
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Fit one machine for each coordinate."""
     weights, bias = np.zeros_like(v), np.zeros(v.shape[1])
     for i in range(v.shape[1]):
@@ -262,4 +276,4 @@ def _support_vectors(
         bias[i] = float(machine.intercept_[0])
     used = (weights != 0).any(axis=1)
     used[0] |= not used.any()
-    return x[used], weights[used], bias, length
+    return x[used], weights[used], bias, np.full(x.shape[1], length)

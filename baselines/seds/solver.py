@@ -6,6 +6,7 @@ gradients the optimum, BIC the number of Gaussians; of several starts the best i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,12 +14,12 @@ from scipy.optimize import minimize
 from sklearn.mixture import GaussianMixture
 
 from iflow_gym.baselines.gmr import (
-    evenly,
+    check_components,
     expectation_maximisation,
     numbers_of_components,
     scaled_samples,
 )
-from iflow_gym.baselines.seds.config import SEDSConfig
+from iflow_gym.baselines.seds.config import Objective, SEDSConfig
 from iflow_gym.baselines.seds.objective import (
     Samples,
     likelihood,
@@ -26,12 +27,12 @@ from iflow_gym.baselines.seds.objective import (
     residual_covariances,
 )
 from iflow_gym.baselines.seds.parameters import Mixture, Parametrisation
+from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import FloatArray
 
 ROOM = 2.0
 """Starts keep the margin so many times, and gains that a solver leaves short of it are moved there:
 the boundary itself has no logarithm and no Cholesky factor."""
-
 
 LEAST_PRIOR = 1e-12
 """Priors are in (0, 1]: one that the solver let vanish is kept at this."""
@@ -61,10 +62,7 @@ def fit_stable_mixture(
     n_components = config.n_components
     if n_components is None:
         n_components = choose_components(evenly(both, config.selection_samples), config, seeds[0])
-    elif n_components > len(both):
-        raise ValueError(
-            f"Expected at most as many Gaussians as samples, {len(both)}, got {n_components}."
-        )
+    check_components(n_components, len(both))
     chosen = evenly(both, max(config.fit_samples, n_components))
     samples = Samples.of(chosen[:, :d], chosen[:, d:])
     form = Parametrisation(n_components, d, config.margin)
@@ -79,9 +77,11 @@ def fit_stable_mixture(
     if config.solver != "L-BFGS-B":
         form = Parametrisation(n_components, d, config.margin, by_construction=False)
         vector = form.vector(solution)
-    last, vector = solve(vector, form, samples, config, config.max_iterations)
-    if last <= value:
-        solution = made_feasible(form.mixture(vector), config.margin)
+    _, vector = solve(vector, form, samples, config, config.max_iterations)
+    last = made_feasible(form.mixture(vector), config.margin)
+    # What counts is the objective where the constraints hold, not where the solver left them.
+    if _objective(config.objective, form, samples, config)(form.vector(last))[0] <= value:
+        solution = last
     return _in_units(solution, samples, config, scale[0], scale[-1])
 
 
@@ -98,8 +98,8 @@ def choose_components(both: FloatArray, config: SEDSConfig, seed: int) -> int:
         form = Parametrisation(k, d, config.margin)
         mixture = _expectation_maximisation(both, k, config, seed)
         start = starts(mixture, config.margin, config.regularisation, samples)[-1]
-        value, _ = _search(
-            form.vector(start), form, samples, "likelihood", config, config.trial_iterations
+        value, _ = solve(
+            form.vector(start), form, samples, config, config.trial_iterations, "likelihood"
         )
         scores[k] = 2 * n * value + (form.size - 1) * np.log(n)
     return min(scores, key=scores.__getitem__)
@@ -168,24 +168,13 @@ def solve(
     samples: Samples,
     config: SEDSConfig,
     max_iterations: int,
+    objective: Objective | None = None,
 ) -> tuple[float, FloatArray]:
-    """Return the objective's value and the vector that the solver reached from `vector`."""
-    return _search(vector, form, samples, config.objective, config, max_iterations)
+    """Return the objective's value and the vector that the solver reached from `vector`.
 
-
-def _search(
-    vector: FloatArray,
-    form: Parametrisation,
-    samples: Samples,
-    objective: str,
-    config: SEDSConfig,
-    max_iterations: int,
-) -> tuple[float, FloatArray]:
-    def value_and_gradient(t: FloatArray) -> Any:
-        if objective == "likelihood":
-            return likelihood(t, form, samples, config.regularisation)
-        return mean_square_error(t, form, samples)
-
+    The objective is that of the settings unless another is named.
+    """
+    value_and_gradient = _objective(objective or config.objective, form, samples, config)
     method = "L-BFGS-B" if form.by_construction else config.solver
     options: dict[str, Any] = {"maxiter": max_iterations}
     extra: dict[str, Any] = {}
@@ -209,6 +198,15 @@ def _search(
     if not np.isfinite(result.x).all() or not np.isfinite(result.fun):
         return np.inf, vector
     return float(result.fun), np.asarray(result.x)
+
+
+def _objective(
+    name: Objective, form: Parametrisation, samples: Samples, config: SEDSConfig
+) -> Callable[[FloatArray], tuple[float, FloatArray]]:
+    """Return the function of a vector that gives the objective's value and gradient."""
+    if name == "likelihood":
+        return lambda vector: likelihood(vector, form, samples, config.regularisation)
+    return lambda vector: mean_square_error(vector, form, samples)
 
 
 def made_feasible(mixture: Mixture, margin: float) -> Mixture:

@@ -1,13 +1,22 @@
 """CLF-DM against finite differences, closed forms, and a motion that no SEDS can make."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
 from iflow_gym.baselines.clf_dm import CLFDM
-from iflow_gym.baselines.clf_dm.energy import Energy, EnergyForm, learn_energy, objective
+from iflow_gym.baselines.clf_dm.controller import Controller
+from iflow_gym.baselines.clf_dm.energy import (
+    Energy,
+    EnergyForm,
+    learn_energies,
+    learn_energy,
+    objective,
+)
+from iflow_gym.baselines.clf_dm.selection import best_controller, reproduction_error
 from iflow_gym.baselines.seds import SEDS
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
@@ -105,6 +114,60 @@ def test_terms_are_added_only_while_they_gain():
     np.testing.assert_allclose(
         found[0].matrices[0], np.eye(2) * found[0].matrices[0][0, 0], atol=1e-3
     )
+
+
+def test_the_v_without_terms_is_found_once_for_every_weight():
+    x = np.random.default_rng(0).normal(size=(300, 2))
+    found = learn_energies(x, -x, (0.01, 0.2), 3, 4, 0.02, np.random.default_rng(0))
+    assert len(found) == 2
+
+
+def test_more_searches_add_to_those_that_were():
+    demonstrations = motion("Sshape")
+    x, v = np.concatenate(demonstrations.positions), np.concatenate(demonstrations.velocities)
+    x = x / np.sqrt(np.mean(x**2))
+    one, two = (learn_energies(x, v, (0.2,), n, 2, 0.02, np.random.default_rng(0)) for n in (1, 2))
+    assert len(two) > len(one) > 1
+    for energy, same in zip(one, two, strict=False):
+        np.testing.assert_array_equal(energy.matrices, same.matrices)
+
+
+# The choice ---------------------------------------------------------------------------------
+
+
+class Linear:
+    """A regressor whose field is known."""
+
+    def __init__(self, matrix):
+        self.matrix = np.array(matrix)
+
+    def velocity(self, x):
+        return x @ self.matrix.T
+
+    def arrays(self):
+        return {"matrix": self.matrix}
+
+
+def test_the_pair_that_made_the_demonstrations_is_found_again():
+    energies = [
+        Energy(np.array([[[1.0, c], [c, 2.0]]]), np.empty((0, 2))) for c in (0.0, 1.2, -1.2)
+    ]
+    regressors = [Linear([[-r, w], [-w, -r]]) for r, w in ((1.0, 0.0), (0.3, 3.0), (0.3, -3.0))]
+
+    def controller(energy, regressor):
+        return Controller(energy, regressor, 1.0, 1.0, "code", 0.05, 500.0)
+
+    dt = np.array([0.02, 0.02])
+    for energy, regressor in itertools.product(energies, regressors[1:]):
+        made, x = [], np.array([[1.0, 0.5], [-0.7, 1.0]])
+        for _ in range(150):
+            made.append(x)
+            x = controller(energy, regressor).step(x, dt)
+        positions = list(np.stack(made, axis=1))
+        found = best_controller(energies, regressors, controller, positions, dt)
+        assert found.regressor is regressor
+        assert found.energy is energy
+        assert reproduction_error(found, positions, dt, 1, 250) == 0.0
 
 
 # The correction -----------------------------------------------------------------------------
@@ -269,7 +332,7 @@ def test_a_file_that_proves_nothing_is_refused(tmp_path, monkeypatch, key, chang
 def test_kernels_of_length_zero_are_refused(tmp_path, monkeypatch):
     system = CLFDM(regressor="gpr", kernel_samples=40, max_terms=0).fit(motion(), seed=0)
     arrays = system._arrays()
-    monkeypatch.setattr(system, "_arrays", lambda: {**arrays, "regressor.length": np.zeros(1)})
-    with pytest.raises(ModelFileError, match="length > 0"):
+    monkeypatch.setattr(system, "_arrays", lambda: {**arrays, "regressor.lengths": np.zeros(2)})
+    with pytest.raises(ModelFileError, match="lengths > 0"):
         CLFDM.load(system.save(tmp_path / "model"))
     assert dataclasses.asdict(system.config)["regressor"] == "gpr"

@@ -167,6 +167,19 @@ def test_bic_finds_the_number_of_clusters():
     assert choose_components(samples, GMRConfig(), seed=0) == 3
 
 
+def test_em_may_start_from_labels():
+    """Three clusters far apart, labelled: the Gaussians keep the labels' order."""
+    from iflow_gym.baselines.gmr import expectation_maximisation
+
+    rng = np.random.default_rng(0)
+    labels = rng.integers(3, size=600)
+    samples = np.array([[0, 0], [9, 0], [0, 9.0]])[labels] + rng.normal(size=(600, 2))
+    mixture = expectation_maximisation(samples, 3, 1, 1e-6, 0, labels)
+    for k in range(3):
+        np.testing.assert_allclose(mixture.means_[k], samples[labels == k].mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(mixture.weights_, np.bincount(labels) / 600, atol=0.005)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

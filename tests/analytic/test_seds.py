@@ -1,12 +1,14 @@
 """SEDS against finite differences, closed forms and motions whose fit is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 
 from iflow_gym.baselines.gmr import scaled_samples
-from iflow_gym.baselines.seds import SEDS
+from iflow_gym.baselines.seds import SEDS, solver
 from iflow_gym.baselines.seds.model import contraction
 from iflow_gym.baselines.seds.objective import Samples, likelihood, mean_square_error
 from iflow_gym.baselines.seds.parameters import Parametrisation
@@ -139,14 +141,40 @@ def test_what_a_solver_leaves_infeasible_is_made_feasible():
     assert made_feasible(mended, 0.1) is mended
 
 
-@pytest.mark.parametrize("solver", ["L-BFGS-B", "SLSQP"])
+@pytest.mark.parametrize("name", ["L-BFGS-B", "SLSQP"])
 @pytest.mark.parametrize("objective", ["likelihood", "mse"])
-def test_every_solver_ends_strictly_inside(solver, objective):
+def test_every_solver_ends_strictly_inside(name, objective):
     settings = {**QUICK, "max_iterations": 30, "trial_iterations": 10, "fit_samples": 300}
-    system = SEDS(solver=solver, objective=objective, **settings).fit(load_lasa("Sshape"), seed=0)
+    system = SEDS(solver=name, objective=objective, **settings).fit(load_lasa("Sshape"), seed=0)
     assert (system.eigenvalues_ < 0).all()
     symmetric = system.gains_ + np.swapaxes(system.gains_, 1, 2)
     np.testing.assert_allclose(system.eigenvalues_, np.linalg.eigvalsh(symmetric))
+
+
+@pytest.mark.parametrize("objective", ["likelihood", "mse"])
+def test_a_solver_that_ends_worse_off_inside_the_constraints_is_not_followed(
+    monkeypatch, objective
+):
+    """It reports a great value at gains that push away: cut to the margin, they are worth less."""
+    settings = {**QUICK, "objective": objective}
+    honest = solver.solve
+
+    def outside(vector, form, *rest):
+        if form.by_construction:
+            return honest(vector, form, *rest)
+        mixture = form.mixture(vector)
+        pushing = dataclasses.replace(mixture, gains=mixture.gains + 20 * np.eye(2))
+        return -1e9, form.vector(pushing)
+
+    monkeypatch.setattr(solver, "solve", outside)
+    kept = SEDS(**settings).fit(load_lasa("Angle"), seed=0)
+
+    def nowhere(vector, form, *rest):
+        return honest(vector, form, *rest) if form.by_construction else (0.0, vector)
+
+    monkeypatch.setattr(solver, "solve", nowhere)
+    trial = SEDS(**settings).fit(load_lasa("Angle"), seed=0)
+    np.testing.assert_allclose(kept.gains_, trial.gains_)
 
 
 # Known answers ------------------------------------------------------------------------------
