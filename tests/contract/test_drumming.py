@@ -13,16 +13,20 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import iflow_gym  # noqa: F401  (registers the ids)
+from iflow_gym.baselines.references import ReplayPolicy
 from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, load_drums
 from iflow_gym.demonstrations import Demonstrations
-from iflow_gym.envs.drumming import recorded, scoring
+from iflow_gym.envs.drumming import recorded
 from iflow_gym.envs.drumming.arguments import OBSERVABLES, ForcePush
 from iflow_gym.envs.drumming.control import JOINT_MARGIN, Workspace
 from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, assets_folder
 from iflow_gym.envs.drumming.simulation import UnreachableError
 from iflow_gym.envs.task import Push
+from iflow_gym.evaluate import FIT_COSTS, evaluate
+from iflow_gym.evaluation import drumming
 from iflow_gym.metrics import drumming as metrics
+from iflow_gym.metrics import metrics_of
 from iflow_gym.metrics.stability import start_grid
 from iflow_gym.registration import DRUMMING_ID, DRUMMING_RECORDED_ID
 
@@ -479,14 +483,14 @@ def test_get_dataset():
 
 
 def test_the_replay_scores_as_a_perfect_drummer(env):
-    scores = env.score(Replay(), seed=0)
-    assert list(scores) == list(scoring.METRICS)
+    scores = evaluate(ReplayPolicy(env.demonstrations), env, seed=0, stability=False).metrics
+    assert set(scores) == {m.name for m in metrics_of("drumming")} - set(FIT_COSTS)
     assert scores["hit_f1"] == scores["sequence_f1"] == 1.0
     assert scores["missed"] == scores["extra"] == 0.0
     assert scores["timing_error"] < 5
-    assert scores["tempo_error"] < 0.002
-    assert scores["recovered"] == 1.0
-    assert scores["rmse"] < 0.001
+    assert scores["orbit_distance"] < 0.001
+    assert scores["tracking_rmse"] < 2
+    assert scores["attraction"] is None
 
 
 def test_a_policy_that_stands_still_or_runs_away_misses_everything():
@@ -497,30 +501,41 @@ def test_a_policy_that_stands_still_or_runs_away_misses_everything():
             self.action = np.array(action)
 
         def predict(self, observation, state=None, episode_start=None, deterministic=True):
-            return self.action, state
+            return np.tile(self.action, (*np.shape(observation)[:-1], 1)), state
 
-    still, away = env.score(Fixed([0.0] * 3), seed=0), env.score(Fixed([np.nan] * 3), seed=0)
-    for scores in (still, away):
-        assert scores["hit_f1"] == scores["sequence_f1"] == 0.0
+    for action in (0.0, np.nan):
+        policy = Fixed([action] * 3)
+        scores = evaluate(policy, env, seed=0, stability=False).metrics
+        assert scores["hit_f1"] == scores["sequence_f1"] == scores["rhythm_f1"] == 0.0
         assert scores["missed"] == 4.0
         assert scores["timing_error"] == scores["tempo_error"] == np.inf
-    assert np.isfinite(still["rmse"])
-    assert away["rmse"] == np.inf
+        assert (scores["orbit_distance"] == np.inf) == bool(np.isnan(action))
     with pytest.raises(TypeError, match="Expected a fitted method or a policy"):
         env.score(3, seed=0)
 
 
-def test_a_fitted_method_is_scored_through_its_policy(env):
-    from iflow_gym.baselines.imitation_flow import ImitationFlow
+def test_arms_side_by_side_do_what_each_does_alone(env):
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (60, 2, 3))
+    arms = env.like(2, horizon=60)
+    first, _ = arms.reset(seed=5, options={"demonstration": np.array([1, 3])})
+    paths = np.stack([first, *[arms.step(a)[0] for a in actions]])
+    for i, index in enumerate((1, 3)):
+        alone = env.like()
+        observation, _ = alone.reset(options={"demonstration": index})
+        np.testing.assert_array_equal(paths[0, i], observation)
+        for k, action in enumerate(actions[:, i]):
+            np.testing.assert_array_equal(paths[k + 1, i], alone.step(action)[0])
 
-    system = ImitationFlow(n_steps=20).fit(env.demonstrations, seed=0)
-    played = scoring.perform(system, env, 0)
-    start = env.demonstrations.positions[0][0]
-    np.testing.assert_allclose(played.path[0], start, atol=1e-5)
-    first = (played.targets[0] - played.path[0]) / env.dt
-    step = system.step(played.path[0], env.dt) - played.path[0]
-    np.testing.assert_allclose(first, step / env.dt, atol=1e-6)
-    assert metrics.tracking_rmse(played.targets, played.path[1:]) < 1.0
+
+def test_what_is_pushed_and_started_elsewhere_is_judged_by_its_last_period(env, monkeypatch):
+    monkeypatch.setattr(drumming, "STARTS", 3)
+    monkeypatch.setattr(drumming, "START_PERIODS", 3)
+    player = ReplayPolicy(env.demonstrations)  # goes to the nearest recording from anywhere
+    found, recovered = drumming.stability(player, env, [0], [7])
+    assert found["attraction"] == 1.0
+    assert found["diverged"] == 0.0
+    assert recovered == [1.0]
+    assert len(drumming.reachable_starts(env)) == 3
 
 
 # The authors' recording -------------------------------------------------------------------------

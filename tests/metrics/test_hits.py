@@ -315,3 +315,42 @@ def test_tracking_rmse_is_in_millimetres():
         m.tracking_rmse(commanded, commanded[:5])
     with pytest.raises(ValueError, match="finite commands"):
         m.tracking_rmse(np.full((10, 3), np.nan), commanded)
+
+
+ROUNDS = np.arange(6)
+STEADY = (
+    np.sort(np.concatenate([5.0 * ROUNDS, 5.0 * ROUNDS + 2.0])),
+    np.tile([0, 1], 6),
+)
+"""Drum 0 every 5 s, drum 1 two fifths of a round later."""
+
+
+class TestRhythm:
+    def test_is_the_mean_of_scores_whatever_their_tempo_and_start(self):
+        times, drums = STEADY
+        scores = [(times, drums), (1.1 * times + 3.0, drums)]
+        np.testing.assert_allclose(m.rhythm(scores), [0.0, 0.4], atol=1e-12)
+        late = np.where(drums == 1, times + 0.5, times)
+        np.testing.assert_allclose(m.rhythm([*scores, *[(late, drums)] * 2]), [0.0, 0.45])
+
+    def test_a_steady_drummer_is_right_at_any_tempo(self):
+        times, drums = STEADY
+        for tempo in (0.7, 1.0, 1.4):
+            assert m.rhythm_f1([0.0, 0.4], tempo * times + 9.0, drums) == 1.0
+
+    def test_what_is_uneven_missing_doubled_or_misplaced_costs(self):
+        times, drums = STEADY
+        assert m.rhythm_f1([0.0, 0.6], times, drums) == pytest.approx(0.5, abs=0.05)
+        assert m.rhythm_f1([0.0, 0.4], times[drums == 0], drums[drums == 0]) == pytest.approx(
+            2 * 6 / (6 + 11)
+        )
+        doubled = np.concatenate([times, times + 0.2]), np.concatenate([drums, drums])
+        assert m.rhythm_f1([0.0, 0.4], *doubled) < 0.7
+        wild = times + np.random.default_rng(0).uniform(-0.6, 0.6, len(times))
+        assert m.rhythm_f1([0.0, 0.4], wild, drums) < 0.6
+
+    def test_silence_and_a_single_round_have_none(self):
+        assert m.rhythm_f1([0.0, 0.4], [], []) == 0.0
+        assert m.rhythm_f1([0.0, 0.4], [1.0, 3.0], [0, 1]) == 0.0
+        with pytest.raises(ValueError, match="a shorter one has no rhythm"):
+            m.rhythm([([1.0, 3.0], [0, 1])])
