@@ -103,6 +103,8 @@ def run_all(options: RunOptions, console: Console) -> int:
             f"{len(cells)} cells, {len(cells) - len(to_do)} up to date, {len(to_do)} to do by "
             f"{min(jobs, max(len(to_do), 1))} workers, into {folder}"
         )
+        for name, count in plan.not_learned(entries, environments).items():
+            reporter.line(f"{name}: not applicable to {count} of {len(environments)} environments")
         Pool(folder, jobs, reporter.event).run(plan.make_jobs(cells, to_do))
     results = [read_result(folder / cell.path) for cell in cells]
     console.print(summary(results))

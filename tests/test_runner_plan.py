@@ -130,9 +130,11 @@ def test_a_class_that_takes_anothers_name_is_refused(make_toy):
 
 def test_presets_say_what_the_documentation_says():
     smoke, standard, full = (load_preset(name) for name in PRESETS)
-    assert smoke.environments == ("LASA-Angle-v0", "LASA-Sshape-v0", "LASA-Sharpc-v0")
+    shapes = ("LASA-Angle-v0", "LASA-Sshape-v0", "LASA-Sharpc-v0")
+    assert smoke.environments == (*shapes, "Letter-O-v0")
     assert smoke.protocols == ("reproduction",)
-    assert len(plan.select_environments(standard.environments)) == 30
+    assert len(plan.select_environments(standard.environments)) == 30 + 4
+    assert len(plan.select_environments(full.environments)) == 30 + 4 + 1
     assert (len(standard.seeds), len(full.seeds)) == (1, 3)
 
 
@@ -283,6 +285,25 @@ def test_the_company_in_a_batch_is_in_the_key_and_only_where_there_are_batches(m
             for environments in (LASA[:3], LASA[:4])
         )
         assert all((many[path] != key) == batched for path, key in few.items())
+
+
+def test_a_method_has_cells_where_it_learns_the_motion_and_the_rest_is_counted():
+    environments = ["iflow/LASA-Angle-v0", "iflow/Letter-I-v0", "iflow/Drumming-v0"]
+    entries = plan.select_entries(["seds", "orbit-field", "dmp", "replay"], "standard")
+    preset = dataclasses.replace(load_preset("standard"), protocols=("reproduction",))
+    found = {entry.name: set() for entry in entries}
+    for cell in plan.make_cells(entries, environments, preset):
+        found[cell.entry.name].add(cell.environment)
+    assert found["seds"] == {environments[0]}
+    assert found["orbit-field"] == set(environments[1:])
+    assert found["dmp"] == found["replay"] == set(environments)
+    assert plan.not_learned(entries, environments) == {"seds": 2, "orbit-field": 1}
+
+
+def test_another_suite_beside_it_changes_no_batch():
+    letters = [f"iflow/Letter-{letter}-v0" for letter in "IROS"]
+    alone = plan.make_batches(LASA, batched=True)
+    assert plan.make_batches([*letters, *LASA], batched=True)[: len(alone)] == alone
 
 
 def test_others_are_a_job_each(make_cells):

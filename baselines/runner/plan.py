@@ -313,6 +313,18 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
     return cells
 
 
+def not_learned(entries: Iterable[Entry], environments: Sequence[str]) -> dict[str, int]:
+    """Return by method's name on how many environments it has no cells, where there are any.
+
+    Their motions are of a kind that it does not learn.
+    """
+    counts = {
+        entry.name: sum(motion_of(task_of(e)) not in entry.motions for e in environments)
+        for entry in entries
+    }
+    return {name: count for name, count in counts.items() if count}
+
+
 def is_up_to_date(cell: Cell, folder: Path) -> bool:
     """Whether a cell has scores under its key; a failed one is to be tried again."""
     try:

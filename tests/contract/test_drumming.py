@@ -60,26 +60,6 @@ def replay(env, index):
     return np.array(reached), hits, infos
 
 
-class Replay:
-    """Plays a demonstration by the clock: the policy that a perfect method would be."""
-
-    def __init__(self, index=None):
-        self.index = index
-
-    def for_environment(self, env):
-        self.env = env
-        return self
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        if state is None:
-            distance = np.linalg.norm(self.env.demonstrations.starts - observation[:3], axis=1)
-            state = (int(distance.argmin()) if self.index is None else self.index, 0)
-        index, k = state
-        path = self.env.demonstrations.positions[index]
-        velocity = (path[min(k + 1, len(path) - 1)] - observation[:3]) / self.env.dt
-        return self.env.command_to_action(velocity, observation), (index, k + 1)
-
-
 @pytest.fixture(scope="module")
 def env():
     return DrummingEnv()
