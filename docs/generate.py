@@ -30,7 +30,12 @@ from iflow_gym.results import read_results
 
 DOCS = Path(__file__).parent
 
-OF = {("goal", "cycle"): "both kinds", ("goal",): "that end", ("cycle",): "that repeat"}
+OF = {
+    ("goal", "cycle", "drumming"): "all",
+    ("goal",): "that end",
+    ("cycle", "drumming"): "that repeat",
+    ("drumming",): "of drumming",
+}
 """Kinds of motion, in words."""
 
 
@@ -192,6 +197,11 @@ within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
 **Motions that repeat** are rolled out over eight periods; the last two are the steady orbit, which
 is compared with the recording's own samples. Attraction is seen from the same grid of starts: over
 the last period a rollout stays within 5 % of the diagonal of the recordings.
+
+**Drumming** adds the hits. `hit_f1` is strict: rounds last a few per cent more or less, and a policy
+without a clock cannot know which recording it is to follow, so that one recording played against
+another one's score gets 0.25. `rhythm_f1` asks for the rhythm that the recordings have in common, at
+any tempo, and `tempo_error` for the tempo.
 
 **Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,
 direction, velocity, likelihood, Lyapunov function) is null for them, not zero. They converge
