@@ -198,10 +198,10 @@ within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
 is compared with the recording's own samples. Attraction is seen from the same grid of starts: over
 the last period a rollout stays within 5 % of the diagonal of the recordings.
 
-**Drumming** adds the hits. `hit_f1` is strict: rounds last a few per cent more or less, and a policy
-without a clock cannot know which recording it is to follow, so that one recording played against
-another one's score gets 0.25. `rhythm_f1` asks for the rhythm that the recordings have in common, at
-any tempo, and `tempo_error` for the tempo.
+**Drumming** adds the hits. `hit_f1` is strict: rounds last a few per cent more or less, and a
+policy without a clock cannot know which recording it is to follow, so that one recording played
+against another one's score gets 0.25. `rhythm_f1` asks for the rhythm that the recordings have in
+common, at any tempo, and `tempo_error` for the tempo.
 
 **Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,
 direction, velocity, likelihood, Lyapunov function) is null for them, not zero. They converge
