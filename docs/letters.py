@@ -14,10 +14,13 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import butter, filtfilt
 
+from iflow_gym import Demonstrations
+from iflow_gym.baselines.orbit_field import OrbitField
 from iflow_gym.datasets.letters import DT, LETTERS, load_letter
 from iflow_gym.datasets.recorded import load_recorded_letter
 from iflow_gym.figures import save_figure
-from iflow_gym.rounds import phases
+from iflow_gym.metrics import orbit_distance, orbit_hausdorff
+from iflow_gym.rounds import period_of, phases
 
 DOCS = Path(__file__).parent
 FAST = 8.0  # Hz: above this, what a hand does is not meant
@@ -39,6 +42,8 @@ class Measures(NamedTuple):
     fast: float
     flutter: float
     slope: float
+    orbit_distance: float
+    orbit_hausdorff: float
 
 
 ROWS = {
@@ -52,6 +57,8 @@ ROWS = {
     "95th percentile of the speed (of the mean)": ("fast", "{:.2f}"),
     "speed's fluctuation above 8 Hz (% of the mean)": ("flutter", "{:.0f}"),
     "slope of log speed against log curvature": ("slope", "{:.2f}"),
+    "mean orbit to a recording, mean (% of the diagonal)": ("orbit_distance", "{:.2f}"),
+    "mean orbit to a recording, Hausdorff (% of the diagonal)": ("orbit_hausdorff", "{:.1f}"),
 }
 
 
@@ -68,7 +75,22 @@ def measure(positions: Sequence[np.ndarray]) -> Measures:
     each = np.array([_measure(p) for p in positions])
     means = each.mean(axis=0)
     between = 100 * np.std(np.log(each[:, 0])) if len(each) > 1 else np.nan
-    return Measures(means[0], means[1], between, *means[2:])
+    return Measures(means[0], means[1], between, *means[2:], *_from_mean_orbit(positions))
+
+
+def _from_mean_orbit(positions: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return how far recordings are from the orbit that is their mean."""
+    motion = Demonstrations.from_arrays(
+        list(positions), dt=DT, period=float(np.mean([period_of(p, DT) for p in positions]))
+    )
+    system, n = OrbitField().fit(motion, seed=0), round(motion.period / DT)
+    begin = system.rollout(positions[0][0], 5 * n, DT)[-1]
+    orbit = system.rollout(begin, 10 * n, DT / 10)
+    size = motion.bounding_box.diagonal / 100
+    return (
+        float(np.mean([orbit_distance(orbit, p) for p in positions])) / size,
+        float(np.mean([orbit_hausdorff(orbit, p) for p in positions])) / size,
+    )
 
 
 def _measure(p: np.ndarray) -> tuple[float, ...]:

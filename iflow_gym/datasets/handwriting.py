@@ -17,7 +17,7 @@ keeps no such promise for its normal numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -53,15 +53,15 @@ class Hand:
     """Curvature, times height, below which the hand becomes no faster."""
     lag: float = 0.25
     """Time constant of the variation, in rounds."""
-    aim: Variation = Variation(0.011, 0.006)
+    aim: Variation = Variation(0.011, 0.004)
     """Of each via point, a coordinate; neighbours on the outline are aimed at alike."""
-    size: Variation = Variation(0.014, 0.015)
+    size: Variation = Variation(0.014, 0.008)
     """Of the logarithm of the size."""
-    slant: Variation = Variation(0.012, 0.015)
+    slant: Variation = Variation(0.012, 0.008)
     """In radians; a shear, as slant is in handwriting."""
-    place: Variation = Variation(0.014, 0.015)
+    place: Variation = Variation(0.014, 0.008)
     """Of the outline's centre, a coordinate."""
-    tempo: Variation = Variation(0.09, 0.10)
+    tempo: Variation = Variation(0.09, 0.05)
     """Of the logarithm of the rate."""
     pulse: float = 0.14
     """Root mean square of the rate's fluctuation in the band of tremor, of the rate."""
@@ -83,6 +83,16 @@ def power_law(curvature: FloatArray, slow: float, fast: float) -> FloatArray:
     square = curvature**2
     effective = (square + fast**2) / (1 + square / slow**2)
     return np.asarray(effective ** (-1 / 6))
+
+
+def steadier(hand: Hand, factor: float) -> Hand:
+    """Return a hand whose path varies by a factor; its tempo varies as before."""
+    scaled = {
+        name: Variation(factor * v.within, factor * v.between)
+        for name in ("aim", "size", "slant", "place")
+        for v in [getattr(hand, name)]
+    }
+    return replace(hand, **scaled)
 
 
 class Outline:
@@ -123,7 +133,14 @@ class Recording(NamedTuple):
 
 
 def trace(
-    outline: Outline, hand: Hand, *, period: float, n_rounds: int, dt: float, seed: tuple[int, ...]
+    outline: Outline,
+    hand: Hand,
+    *,
+    period: float,
+    n_rounds: int,
+    dt: float,
+    tempo: float,
+    seed: tuple[int, ...],
 ) -> Recording:
     """Trace an outline for a number of whole rounds, from anywhere on it.
 
@@ -133,6 +150,9 @@ def trace(
         Duration of a round at the hand's usual tempo, seconds.
     n_rounds : int
         The recording ends with the first sample that completes so many rounds.
+    tempo : float
+        How far the recording's own tempo is from the usual one, in standard deviations of
+        `Hand.tempo` between recordings.
     seed : tuple of ints
         Of the random numbers.
 
@@ -150,6 +170,7 @@ def trace(
         [2, 2 + 2 * n_via],
     )
     constants = _uniform(bits, (2 * n_via + 6,))
+    constants[-2] = tempo
     tremor = _band(
         _uniform(bits, (3, n + round(4 / (hand.tremor_bandwidth * dt)))),
         hand.tremor_frequency * dt,
@@ -162,14 +183,14 @@ def trace(
     shift = varied(place, constants[:2], hand.place)
     aims = varied(aim, constants[2 : 2 + 2 * n_via], hand.aim).reshape(2, n_via, n)
     aims = (2 * aims + np.roll(aims, 1, axis=1) + np.roll(aims, -1, axis=1)) / np.sqrt(6)
-    size, slant, tempo = (
+    size, slant, pace = (
         varied(process, constant, amount)
         for process, constant, amount in zip(
             rest, constants[2 + 2 * n_via :], (hand.size, hand.slant, hand.tempo), strict=False
         )
     )
     start = constants[-1] / np.sqrt(12) + 0.5
-    rate = np.exp(tempo + hand.pulse * tremor[2]) * dt / period
+    rate = np.exp(pace + hand.pulse * tremor[2]) * dt / period
     phase = start + np.cumsum(rate) - rate[: MARGIN + 1].sum()  # sample MARGIN is at the start
     end = int(np.argmax(phase >= start + n_rounds)) + 1 + MARGIN
     height = outline.height
