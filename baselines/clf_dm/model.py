@@ -23,8 +23,8 @@ Deviations from the paper:
   promises nothing.
 - V is searched for without constraints (Cholesky factors), from several starts for each L and for
   several w, each P with eigenvalues of a bounded ratio. Of the V for every w and every L that
-  gained, and of several mixtures, the pair is kept whose reproductions of the
-  fitted demonstrations have the least Fréchet distance to them.
+  gained, and of several mixtures, the pair is kept whose reproductions of the fitted demonstrations
+  have the least Fréchet distance to them (`selection`).
 """
 
 from __future__ import annotations
