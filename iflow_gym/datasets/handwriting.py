@@ -87,12 +87,17 @@ def power_law(curvature: FloatArray, slow: float, fast: float) -> FloatArray:
 
 def steadier(hand: Hand, factor: float) -> Hand:
     """Return a hand whose path varies by a factor; its tempo varies as before."""
-    scaled = {
-        name: Variation(factor * v.within, factor * v.between)
-        for name in ("aim", "size", "slant", "place")
-        for v in [getattr(hand, name)]
-    }
-    return replace(hand, **scaled)
+
+    def scaled(amount: Variation) -> Variation:
+        return Variation(factor * amount.within, factor * amount.between)
+
+    return replace(
+        hand,
+        aim=scaled(hand.aim),
+        size=scaled(hand.size),
+        slant=scaled(hand.slant),
+        place=scaled(hand.place),
+    )
 
 
 class Outline:
