@@ -17,11 +17,11 @@ class CLFDMConfig:
     """What estimates the velocity before it is corrected: a Gaussian mixture, a Gaussian process,
     or support vector machines."""
     n_components: int | None = None
-    """Gaussians of the mixture; None tries the number of least BIC, up to four fewer and up to eight
-    more."""
+    """Gaussians of the mixture; None tries the number of least BIC, up to four fewer, and up to
+    eight more."""
     n_initialisations: int = 2
-    """Starts of EM for each number of Gaussians: the first cuts every demonstration into as many pieces
-    of equal time, the others are by k-means. Every mixture is tried."""
+    """Starts of EM for each number of Gaussians: the first cuts every demonstration into as many
+    pieces of equal time, the others are by k-means. Every mixture is tried."""
     kernel_samples: int = 400
     """Samples, evenly taken, that a Gaussian process or support vector machine is fitted on."""
     max_terms: int = 4
