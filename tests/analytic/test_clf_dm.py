@@ -311,10 +311,12 @@ def test_settings_that_are_none_are_refused(name, value):
 
 # Files --------------------------------------------------------------------------------------
 
+APART = 1 - np.eye(2)
+
 TAMPERED = {
     "a V that is none": ("matrices", lambda a: -a, "matrix of V > 0 on the diagonal"),
     "a lopsided V": ("matrices", lambda a: a * [[1, 1.5], [1, 1]], "symmetric matrix of V"),
-    "a saddle": ("matrices", lambda a: a + 9 * np.abs(a).max() * (1 - np.eye(2)), "definite"),
+    "a saddle": ("matrices", lambda a: a + 9 * np.trace(a.T)[:, None, None] * APART, "definite"),
     "a length of 0": ("scales", lambda a: a * [0.0, 1.0], "scales of length and time > 0"),
     "priors": ("regressor.priors", lambda a: 5 * a, "priors > 0 that sum to 1"),
 }
