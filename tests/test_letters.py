@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from iflow_gym.datasets.handwriting import (
     Variation,
     central_difference,
     power_law,
+    steadier,
     trace,
 )
 from iflow_gym.datasets.letters import (
@@ -305,11 +307,27 @@ def test_letters_vary_as_the_recorded_ones_do(monkeypatch):
     for name in ("period", "tempo_within", "rounds_apart", "speed", "slow", "fast", "flutter"):
         assert 0.7 < ratio(name) < 1.35, name
     np.testing.assert_allclose(ours[:, 0], theirs[:, 0], rtol=0.25)
+    for name in ("orbit_distance", "orbit_hausdorff"):  # letter by letter
+        np.testing.assert_allclose(ours[:, index[name]], theirs[:, index[name]], rtol=0.18)
     assert np.abs(theirs[:, index["slope"]].mean() + 1 / 3) < 0.12
     written = (ROOT / "docs" / "letters.md").read_text()
     assert page.with_table(written, page.table(measured)) == written
 
 
-def test_the_usual_period_is_about_the_mean_one():
-    for letter in LETTERS:
-        assert load_letter(letter).period == pytest.approx(_PERIODS[letter], rel=0.08)
+@pytest.mark.parametrize("letter", LETTERS)
+def test_those_to_fit_on_and_those_held_out_have_the_usual_tempo(letter):
+    for part in load_letter(letter).split("generalisation"):
+        assert part.durations.mean() / N_ROUNDS == pytest.approx(_PERIODS[letter], rel=0.03)
+
+
+def test_a_steadier_hand_varies_less_in_path_and_as_much_in_tempo():
+    shape, moved = outline("S"), []
+    still = trace(shape, STILL, period=1.0, n_rounds=2, dt=DT, tempo=0.0, seed=(5,))
+    hand = replace(HAND, tempo=Variation(0), pulse=0, tremor=0)
+    for factor in (0.5, 1.0):
+        r = trace(
+            shape, steadier(hand, factor), period=1.0, n_rounds=2, dt=DT, tempo=0.0, seed=(5,)
+        )
+        moved.append(np.linalg.norm(r.positions - still.positions[: len(r.positions)], axis=1))
+    np.testing.assert_allclose(moved[0].mean() / moved[1].mean(), 0.5, rtol=0.02)
+    assert steadier(HAND, 0.5).tempo == HAND.tempo

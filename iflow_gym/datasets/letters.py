@@ -70,8 +70,8 @@ _PERIODS = {"I": 0.8, "R": 2.6, "O": 0.75, "S": 1.0}
 
 HAND = Hand()
 
-_STEADINESS = {"I": 0.65, "R": 1.05, "O": 0.7, "S": 1.0}
-"""How much the path varies, of what `HAND` varies: round letters are traced more steadily."""
+_VARIATION = {"I": 0.65, "R": 1.05, "O": 0.7, "S": 1.0}
+"""How much the path varies, of what `HAND`'s does: simple letters are traced more steadily."""
 
 _TEMPOS = (4, 7, 0, 9, 2, 5, 8, 1, 6, 3)
 """Ranks of the recordings' own tempos among each ten."""
@@ -107,7 +107,7 @@ def load_letter(letter: str) -> Demonstrations:
 
 def recordings(letter: str) -> list[Recording]:
     """Return what the hand did in full precision, with the phase of each sample in rounds."""
-    shape, hand = outline(letter), steadier(HAND, _STEADINESS[letter])
+    shape, hand = outline(letter), steadier(HAND, _VARIATION[letter])
     return [
         trace(
             shape,
