@@ -119,6 +119,11 @@ class OrbitField(DynamicalSystem):
     not_learned: ClassVar[str] = "its systems go round a closed curve"
 
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
+        if demonstrations.n_dims < 2:
+            raise ValueError(
+                "Expected a motion in at least 2 dimensions, where a closed curve need not pass a "
+                "point twice, got 1."
+            )
         period = demonstrations.period
         assert period is not None
         self._adopt(self._fitted_weights(demonstrations, period), period)

@@ -85,17 +85,26 @@ def _distances(shown: FloatArray, others: Demonstrations) -> dict[str, float]:
 
 
 def _orbit_distances(shown: FloatArray, dt: float, others: Demonstrations) -> dict[str, float]:
-    """Return the smallest of each distance from a recording's orbit to any but its own."""
+    """Return the smallest of each distance from a recording's orbit to any but its own.
+
+    Its period is compared with the mean of the others', as a method's is.
+    """
     own = metrics.period(shown, dt, about=others.period)
     found = [
         {
             "orbit_distance": metrics.orbit_distance(p, shown),
             "orbit_hausdorff": metrics.orbit_hausdorff(p, shown),
-            "period_error": metrics.period_error(metrics.period(p, h, about=others.period), own),
+            "period": metrics.period(p, h, about=others.period),
         }
         for p, h in _others(shown, others)
     ]
-    return {name: min(row[name] for row in found) for name in found[0]}
+    least = {
+        name: min(row[name] for row in found) for name in ("orbit_distance", "orbit_hausdorff")
+    }
+    tempo = float(np.mean([row["period"] for row in found]))
+    if np.isfinite([own, tempo]).all():  # recordings of little more than a round show none
+        least["period_error"] = metrics.period_error(own, tempo)
+    return least
 
 
 def _others(shown: FloatArray, others: Demonstrations) -> list[tuple[FloatArray, float]]:

@@ -94,6 +94,9 @@ The batched version steps all at once in NumPy and gives the bits that the singl
 
 def drumming() -> str:
     """Return the page of the drumming arm."""
+    rows = "\n".join(
+        f"| `{m.name}` | {m.definition} |" for m in METRICS if m.motions == ("drumming",)
+    )
     return f"""# Drumming
 
 ![The arm plays one round](images/drumming.gif)
@@ -124,22 +127,18 @@ for following in path[1:]:
 ## What the scores mean
 A demonstration implies a score: where the bead of its stick comes down to a head is a note. Its
 replay by the arm hits every note within 2 ms. `env.unwrapped.score(system, seed=0)` rolls a policy
-out from each demonstration's start, for its 10 s, and compares its hits with that score:
+out from each demonstration's start for eight periods, on the tip that the physics moves. The hits
+of as long as the demonstration lasts are compared with its score, those of the whole with the
+rhythm that the demonstrations have in common; beside them stand the metrics of
+[cycles](metrics.md#accuracy):
 
 | name | what it is |
 | --- | --- |
-| `hit_f1` | F1 of the hits within 50 ms of a note of their drum, one to one |
-| `sequence_f1` | F1 of the order of the drums alone, whenever they are hit |
-| `timing_error` | mean time between matched notes and hits, ms |
-| `tempo_error` | relative error of a round's duration |
-| `missed`, `extra` | notes without a hit; hits without a note |
-| `tracking_rmse` | the tip's distance from where it was commanded to be, mm |
-| `rmse` | the tip's distance from the demonstration at the same time, m |
-| `recovered` | share of rollouts that, pushed half way, are on the orbit in their last second |
+{rows}
 
 `hit_f1` is strict: rounds last a few per cent more or less, so one demonstration played against
 another one's score gets 0.25 on average, and 0.62 at the best shift in time. A policy without a
-clock cannot know which of them it is to follow; `sequence_f1` and `tempo_error` say whether it
+clock cannot know which of them it is to follow; `rhythm_f1` and `tempo_error` say whether it
 drums.
 
 ## Pictures

@@ -114,7 +114,7 @@ class PointMassTask:
         self.n_dims = demonstrations.n_dims
         box = demonstrations.bounding_box
         self.diagonal = box.diagonal
-        self.guide = guide_for(demonstrations)
+        self.guide = guide_for(demonstrations.shown)  # what is held out guides nobody
         self.tolerance = self.guide.tolerance
         half = ARENA / 2 * np.maximum(box.high - box.low, THINNEST_SIDE * self.diagonal)
         centre = (box.low + box.high) / 2
@@ -171,7 +171,7 @@ class PointMassTask:
         demos = self.demonstrations
         index = demonstration
         if index is None and start is None:
-            index = int(rng.integers(len(demos)))
+            index = int(rng.integers(len(demos) - demos.held_out))
         if index is None:
             index, dt = -1, demos.mean_dt
             n_steps = max(1, round(float(demos.durations.mean()) / dt))

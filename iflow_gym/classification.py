@@ -186,4 +186,5 @@ def varied(
         name=demonstrations.name,
         length_unit=demonstrations.length_unit,
         source=demonstrations.source,
+        held_out=demonstrations.held_out,
     )

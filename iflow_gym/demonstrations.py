@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -23,6 +23,12 @@ PROTOCOLS = ("reproduction", "generalisation")
 
 GOAL_TOLERANCE = 0.02
 """Ends may lie this far from the goal, as a fraction of the bounding box's diagonal."""
+
+LEAST_ROUND = 4
+"""Samples that a round has at least."""
+
+LEAST_ROUNDS = 0.95
+"""Rounds that the longest recording of a motion that repeats has at least."""
 
 UNEVEN_TOLERANCE = 1e-3
 """Steps in `times` may differ from their mean by this fraction of it."""
@@ -111,7 +117,8 @@ class Demonstrations:
             How far a recording may end from the goal; by default 2 % of the diagonal of the
             recordings' bounding box.
         period : float, seconds, optional
-            Set for a motion that goes round and round; there is no goal then.
+            Of a motion that goes round and round; there is no goal then. The longest recording
+            lasts a round at least, and a round at least 4 samples.
         resample : bool
             Interpolate recordings with uneven `times` linearly on an even grid of as many
             samples.
@@ -157,6 +164,8 @@ class Demonstrations:
             )
         elif not (np.isfinite(period) and period > 0):
             raise ValueError(f"Expected a positive period in seconds, got {period}.")
+        else:
+            _check_period(period, points, steps)
         if type(held_out) is not int or not 0 <= held_out < len(points):
             raise ValueError(
                 f"Expected held_out to be a whole number from 0 to {len(points) - 1}, one less "
@@ -275,6 +284,11 @@ class Demonstrations:
         """Names of the splits that the set has: one recording leaves none to hold out."""
         return PROTOCOLS if len(self) > 1 else PROTOCOLS[:1]
 
+    @cached_property
+    def shown(self) -> Demonstrations:
+        """The recordings that are not held out."""
+        return self.subset(range(len(self) - self.held_out)) if self.held_out else self
+
     def split(self, protocol: str = "reproduction") -> Split:
         """Return what to fit on and what to score on.
 
@@ -284,19 +298,34 @@ class Demonstrations:
         """
         if protocol not in PROTOCOLS:
             raise ValueError(f"Expected a protocol of {PROTOCOLS}, got {protocol!r}.")
-        n_shown = len(self) - self.held_out
-        shown = self.subset(range(n_shown)) if self.held_out else self
+        shown = self.shown
         if protocol == "reproduction":
             return Split(shown, shown)
         if self.held_out:
-            return Split(shown, self.subset(range(n_shown, len(self))))
+            return Split(shown, self.subset(range(len(shown), len(self))))
         if len(self) < 2:
             raise ValueError(
                 f"Expected at least 2 recordings for the generalisation protocol, got {len(self)}: "
                 "record more, or use the reproduction protocol."
             )
         n_fit = min(max(round(len(self) * 4 / 7), 1), len(self) - 1)
-        return Split(self.subset(range(n_fit)), self.subset(range(n_fit, len(self))))
+        fit = self.subset(range(n_fit))
+        return Split(fit._with_own_period(), self.subset(range(n_fit, len(self))))
+
+    def _with_own_period(self) -> Demonstrations:
+        """Return the set with the period of its own recordings, where they show one.
+
+        The period of a whole set knows the tempo of the recordings that are held out.
+        """
+        if self.period is None:
+            return self
+        from iflow_gym.rounds import period_of
+
+        try:
+            found = [period_of(p, h) for p, h in zip(self.positions, self.dt, strict=True)]
+        except ValueError:  # too short to show a round
+            return self
+        return replace(self, period=float(np.mean(found)))
 
 
 def _several(arrays: Sequence[ArrayLike]) -> Sequence[ArrayLike]:
@@ -436,6 +465,16 @@ def _meeting_point(
             "the motion repeats."
         )
     return target
+
+
+def _check_period(period: float, points: list[FloatArray], steps: list[float]) -> None:
+    longest = max(len(p) * h for p, h in zip(points, steps, strict=True))
+    if not LEAST_ROUND * max(steps) <= period <= longest / LEAST_ROUNDS:
+        raise ValueError(
+            f"Expected a period of {LEAST_ROUND} samples at least, {LEAST_ROUND * max(steps):g} s, "
+            f"and at most what the longest recording lasts, {longest:g} s, got {period:g} s: check "
+            "the units of period and dt (both seconds), or find it by iflow_gym.rounds.period_of."
+        )
 
 
 def _rounded_up(value: float) -> float:

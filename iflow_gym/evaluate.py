@@ -49,7 +49,8 @@ class Evaluation:
     """Values for each scored demonstration, in their order."""
     likelihoods: dict[str, list[float]] = field(default_factory=dict)
     """Log densities, nats, of the scored demonstrations of each motion that this one is to be told
-    apart from, itself among them, by environment id; empty where there are none."""
+    apart from, itself among them, by environment id; empty where there are none, and in
+    reproduction, where nothing is held out."""
 
 
 def score(
@@ -139,7 +140,8 @@ def evaluate(
     values["step_us"] = step_us(policy, task, scored)
     values |= {name: statistic(np.mean, v) for name, v in per_demonstration.items()}
     medians = {name: statistic(np.median, v) for name, v in per_demonstration.items()}
-    rivals = {} if system is None else _likelihoods(system, task, protocol)
+    unseen = protocol == "generalisation"
+    rivals = _likelihoods(system, task, protocol) if system is not None and unseen else {}
     return Evaluation(values, medians, per_demonstration, rivals)
 
 
@@ -155,7 +157,7 @@ def _likelihoods(system: DynamicalSystem, task: Any, protocol: str) -> dict[str,
     for rival in task.rivals:
         others = _task_environment(rival).demonstrations.split(protocol).score
         densities = [
-            system.trajectory_log_prob(p, dt)
+            system.trajectory_log_prob(p, dt, initial=True)
             for p, dt in zip(others.positions, others.dt, strict=True)
         ]
         if any(density is None for density in densities):

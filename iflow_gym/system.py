@@ -293,15 +293,24 @@ class DynamicalSystem(Method):
         value = self._log_prob(states, following, seconds(dt))
         return None if value is None else value.reshape(shape[:-1])
 
-    def trajectory_log_prob(self, x: ArrayLike, dt: float) -> float | None:
-        """Return log p(tau) of a trajectory x, shape (T, d), given its first state; or None.
+    def trajectory_log_prob(
+        self, x: ArrayLike, dt: float, *, stride: int = 1, initial: bool = False
+    ) -> float | None:
+        """Return log p(tau) of a trajectory x, shape (T, d), sampled every dt; or None.
 
-        The sum of its transitions' log densities, in nats; None for a method without a density.
+        The sum of the log densities of its transitions over `stride` samples, in nats; None for a
+        method without a density. With `initial` the first state counts with its stationary
+        density, where the method has one; this one has none.
         """
         states, shape = self._states(x)
-        if len(shape) != 2 or len(states) < 2:
-            raise ValueError(f"Expected a trajectory (T, d) of two samples or more, got {shape}.")
-        value = self._log_prob(states[:-1], states[1:], seconds(dt))
+        stride = whole_number(stride)
+        if len(shape) != 2 or stride < 1 or len(states) <= stride:
+            raise ValueError(
+                f"Expected a trajectory (T, d) of more than stride = {stride} >= 1 samples, got "
+                f"shape {shape}."
+            )
+        states = states[::stride]
+        value = self._log_prob(states[:-1], states[1:], stride * seconds(dt))
         return None if value is None else float(value.sum())
 
     @abstractmethod

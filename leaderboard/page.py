@@ -76,8 +76,15 @@ BESIDE = ("LASA-Multi",)
 PROTOCOLS = {
     "reproduction": "fitted on all demonstrations that are shown, and scored on them",
     "generalisation": "fitted on demonstrations 1-4 of LASA's seven and scored on 5-7; of a "
-    "letter's twenty on 1-10 and 11-20",
+    "letter's twenty on 1-10 and 11-20; of the six of drumming on 1-3 and 4-6",
 }
+
+KINDS: dict[Motion, str] = {
+    "goal": "of motions that end",
+    "cycle": "of motions that repeat",
+    "drumming": "of drumming",
+}
+"""Kinds of motion, in words."""
 
 WHAT = {
     "LASA-26": "handwriting motions, each in one way",
@@ -288,7 +295,9 @@ def render(
     page = ["# Leaderboard", ""]
     page += [
         "Methods that learn a motion from demonstrations, scored on the same ground. Lower is "
-        "better, but for *converged* and *recovery*. **Bold** is the best value among the "
+        "better, but for "
+        + ", ".join(f"*{m.title.lower()}*" for m in METRICS if m.better == "higher")
+        + " and *classification*. **Bold** is the best value among the "
         "competitors; rows in *italics* are references and do not compete: *nearest demonstration* "
         "is how far the recordings are from each other, *replay* plays the recording back. Rows "
         "marked *uses time* follow a clock that was started with the motion: they are no field, so "
@@ -452,8 +461,9 @@ def about(
         "- **Units**: " + "; ".join(f"{f} lengths in {u}" for f, u in units.items()) + ".",
         "- **Aggregates**: the interquartile mean is the mean of the middle half of the scores. A "
         "score of ∞ is a runaway and counts. The mean rank is taken over environments and over "
-        + "; of cycles over ".join(
-            ", ".join(get_metric(m).title for m in names) for names in RANKED.values()
+        + "; ".join(
+            f"{KINDS[motion]} over " + ", ".join(get_metric(m).title for m in names)
+            for motion, names in RANKED.items()
         )
         + ", those that apply to every competitor; a cell without scores ranks last.",
         "- **Guarantee**: *proved* by construction for every state, *verified* on a bounded region "

@@ -17,7 +17,7 @@ class CLFDMConfig:
     """What estimates the velocity before it is corrected: a Gaussian mixture, a Gaussian process,
     or support vector machines."""
     n_components: int | None = None
-    """Gaussians of the mixture; None tries the number of least BIC, up to four fewer and up to
+    """Gaussians of the mixture; None tries the number of least BIC, up to four fewer, and up to
     eight more."""
     n_initialisations: int = 2
     """Starts of EM for each number of Gaussians: the first cuts every demonstration into as many

@@ -27,11 +27,8 @@ LEAST_SHARE = 0.02
 the authors' demonstration, a tenth). Without it level sets are slits, along which a state may go
 far away before V lets it return."""
 
-CANDIDATES = 8
-"""Places where a new asymmetric term is tried."""
-
-TRIAL_ITERATIONS, ITERATIONS = 60, 300
-"""Of the solver, for each candidate and from the best."""
+ROUNDS = (8, 20), (3, 60), (1, 300)
+"""How many places where a new asymmetric term is tried go on, and for how many iterations more."""
 
 LEAST_SPEED = 0.05
 """Of the fastest sample: a hand that hesitates has no direction to learn from."""
@@ -292,17 +289,21 @@ def learn_energy(
         return float(result.fun), np.asarray(result.x)
 
     form = EnergyForm(0, d)
-    best, vector = search(form.flattened(np.eye(d)[None], np.empty((0, d))), form, ITERATIONS)
+    start = form.flattened(np.eye(d)[None], np.empty((0, d)))
+    best, vector = search(start, form, ROUNDS[-1][1])
     found = [form.energy(vector)]
     for n_terms in range(1, max_terms + 1):
         roots, centres = form.roots_and_centres(vector)
         wider = EnergyForm(n_terms, d)
-        starts = [_start(wider, roots, centres, x, rng, i % 2 == 0) for i in range(CANDIDATES)]
-        tried = [search(start, wider, TRIAL_ITERATIONS) for start in starts]
-        value, reached = search(min(tried, key=lambda t: t[0])[1], wider, ITERATIONS)
+        starts = [_start(wider, roots, centres, x, rng, i % 2 == 0) for i in range(ROUNDS[0][0])]
+        for n_kept, iterations in ROUNDS:
+            reached = [search(start, wider, iterations) for start in starts[:n_kept]]
+            reached.sort(key=lambda entry: entry[0])
+            starts = [place for _, place in reached]
+        value = reached[0][0]
         if best - value < least_gain * max(best + weight, LEAST_LEFT * weight):
             break
-        best, vector, form = value, reached, wider
+        best, vector, form = value, starts[0], wider
         found.append(form.energy(vector))
     return [_scaled(energy, x) for energy in found]
 

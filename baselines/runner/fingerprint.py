@@ -26,6 +26,7 @@ ENVIRONMENTS = "iflow_gym.envs"
 
 CORE = (
     "iflow_gym.baselines.runner.scoring",
+    "iflow_gym.datasets.drums",
     "iflow_gym.demonstrations",
     "iflow_gym.evaluate",
     "iflow_gym.evaluation",
@@ -64,7 +65,14 @@ METRICS = "iflow_gym.metrics"
 CORE_LIBRARIES = ("gymnasium", "numpy", "scipy")
 """Distributions that every score depends on."""
 
-LIBRARIES = (*CORE_LIBRARIES, "scikit-learn", "torch")
+MOTION_LIBRARIES: dict[Motion, tuple[str, ...]] = {
+    "goal": (),
+    "cycle": (),
+    "drumming": ("mujoco", "gymnasium-robotics"),
+}
+"""Distributions that the scores of a kind of motion depend on beside them."""
+
+LIBRARIES = (*CORE_LIBRARIES, "gymnasium-robotics", "mujoco", "scikit-learn", "torch")
 """Distributions whose versions every record names."""
 
 

@@ -26,6 +26,7 @@ from iflow_gym.baselines.registry import (
 )
 from iflow_gym.baselines.runner.fingerprint import (
     CORE_LIBRARIES,
+    MOTION_LIBRARIES,
     core_hash,
     method_code,
     sha256_of,
@@ -295,8 +296,10 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
                     "core": core_hash(entry_points(environment), motion),
                     "config": sha256_of(entry.config),
                 }
-                company = [paths, data]
-                decisive = [entry.target, environment, protocol, seed, hashes, used, company]
+                rivals = [demonstrations_of(e).sha256 for e in task_of(environment).rivals]
+                company = [paths, data, rivals]
+                needed = used | {x: entry.versions.get(x) for x in MOTION_LIBRARIES[motion]}
+                decisive = [entry.target, environment, protocol, seed, hashes, needed, company]
                 cells.append(
                     Cell(
                         entry=entry,

@@ -22,6 +22,14 @@ from iflow_gym.evaluation.rollouts import (
     stability_rollouts,
 )
 from iflow_gym.metrics.cycles import ATTRACTION_TOLERANCE, PERIODS, STEADY_PERIODS
+from iflow_gym.metrics.stability import PERTURBATION_TIME
+
+PUSHED_PERIODS = 4
+"""Of a longer recording the push comes at 40 % of so many periods: the rollout has eight, and what
+is left of them to recover."""
+
+SHOWS_PERIOD = 1.5
+"""A recording shows its period if it lasts so many of the set's."""
 
 
 def accuracy(
@@ -47,17 +55,19 @@ def scores_of(paths: FloatArray, scored: Demonstrations) -> PerDemonstration:
     for path, recording, dt, n in zip(paths, scored.positions, scored.dt, counts, strict=True):
         path = path[: PERIODS * n + 1]
         steady = path[-STEADY_PERIODS * n :]
-        turned = metrics.period(path[len(path) // 2 :], dt, size=size)
+        turned = metrics.period(path[len(path) // 2 :], dt, size=size, about=period)
         rounds = [recording[k : k + n] for k in range(0, len(recording) - n + 1, n)]
         row = {
             "dtw": metrics.dtw(recording[:n], path[:n]),
             "orbit_distance": metrics.orbit_distance(steady, recording),
             "orbit_hausdorff": metrics.orbit_hausdorff(steady, recording),
             "period_error": metrics.period_error(turned, period),
-            "phase_rmse": np.mean([metrics.phase_rmse(steady, r) for r in rounds]),
+            "phase_rmse": np.mean([metrics.phase_rmse(steady, r) for r in rounds])
+            if rounds
+            else None,
         }
         for name, value in row.items():
-            found.setdefault(name, []).append(float(value))
+            found.setdefault(name, []).append(None if value is None else float(value))
     return found
 
 
@@ -71,7 +81,11 @@ def stability(
     shown = np.concatenate(demos.positions)
     n = samples(demos.period, demos.mean_dt)
     slowest = max(samples(demos.period, demos.dt[i]) for i in indices)
-    paths, pushed = stability_rollouts(policy, task, indices, push_seeds, PERIODS * max(n, slowest))
+    longest = max(float(demos.durations[i]) for i in indices)
+    push_time = PERTURBATION_TIME * min(1.0, PUSHED_PERIODS * demos.period / longest)
+    paths, pushed = stability_rollouts(
+        policy, task, indices, push_seeds, PERIODS * max(n, slowest), push_time
+    )
     tolerance = ATTRACTION_TOLERANCE * metrics.box_diagonal(low, high)
     found: Scores = {
         "attraction": metrics.fraction(metrics.attracted(paths, shown, tolerance, n)),
@@ -84,13 +98,13 @@ def stability(
 def mean_period(demonstrations: Demonstrations) -> float:
     """Return the mean of the recordings' periods in seconds; the set's own for short recordings.
 
-    A recording shows its period if it lasts two of the set's.
+    A recording shows its period if it lasts `SHOWS_PERIOD` of the set's.
     """
     assert demonstrations.period is not None
     found = [
         metrics.period(p, dt, about=demonstrations.period)
         for p, dt in zip(demonstrations.positions, demonstrations.dt, strict=True)
-        if len(p) * dt >= 2 * demonstrations.period
+        if len(p) * dt >= SHOWS_PERIOD * demonstrations.period
     ]
     finite = [value for value in found if np.isfinite(value)]
     return float(np.mean(finite)) if finite else demonstrations.period

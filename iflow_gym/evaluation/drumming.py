@@ -46,7 +46,8 @@ def accuracy(
     paths = rollouts(policy, [arms], first, PERIODS * n)
     found = cycles.scores_of(paths, scored)
     targets = np.stack(arms.targets, axis=1)
-    rhythm = hits.rhythm([task.score_of(index) for index in indices])
+    rhythm = _rhythm(task, indices)
+    period, duration = cycles.mean_period(scored), PERIODS * n * task.dt
     for i, index in enumerate(indices):
         notes = task.score_of(index)
         length = len(task.demonstrations.positions[index])
@@ -55,15 +56,19 @@ def accuracy(
         row = {
             "hit_f1": hits.hit_f1(*together),
             "sequence_f1": hits.sequence_f1(*together),
-            "rhythm_f1": hits.rhythm_f1(rhythm, *_played(arms.hits[i])),
+            "rhythm_f1": None
+            if rhythm is None
+            else hits.rhythm_f1(rhythm, *_played(arms.hits[i]), period, duration),
             "timing_error": hits.timing_error(*together),
-            "tempo_error": hits.tempo_error(*notes, *_played(arms.hits[i])),
+            "tempo_error": None
+            if rhythm is None
+            else hits.tempo_error(*notes, *_played(arms.hits[i])),
             "missed": float(hits.missed(*together)),
             "extra": float(hits.extra(*together)),
             "tracking_rmse": hits.tracking_rmse(targets[i], paths[i, 1:]),
         }
         for name, value in row.items():
-            found.setdefault(name, []).append(float(value))
+            found.setdefault(name, []).append(None if value is None else float(value))
     return found
 
 
@@ -111,6 +116,14 @@ def reachable_starts(task: DrummingEnv) -> FloatArray:
     reached = grid[task.like().reachable(grid)]
     chosen = np.linspace(0, len(reached) - 1, min(STARTS, len(reached))).round().astype(int)
     return np.asarray(reached[chosen])
+
+
+def _rhythm(task: DrummingEnv, indices: Sequence[int]) -> FloatArray | None:
+    """Return the demonstrations' common rhythm; None if one has a single round or lacks a drum."""
+    try:
+        return hits.rhythm([task.score_of(index) for index in indices])
+    except ValueError:
+        return None
 
 
 def _played(played: Sequence[hits.Hit]) -> tuple[FloatArray, hits.IntArray]:

@@ -138,6 +138,7 @@ def stability_rollouts(
     indices: Sequence[int],
     push_seeds: Sequence[int],
     n_steps: int,
+    push_time: float = PERTURBATION_TIME,
 ) -> tuple[FloatArray, FloatArray]:
     """Return paths from the grid of starts, and pushed ones from where demonstrations begin.
 
@@ -149,7 +150,7 @@ def stability_rollouts(
     per_axis = None if d in STARTS_PER_AXIS else max(2, round(STARTS ** (1 / d)))
     grid = metrics.start_grid(low, high, per_axis)
     free = task.like(len(grid), horizon=n_steps)
-    push = Push(PERTURBATION_TIME, PERTURBATION_SIZE)
+    push = Push(push_time, PERTURBATION_SIZE)
     pushed = task.like(len(indices), horizon=n_steps, perturbation=push)
     from_grid, _ = free.reset(seed=0, options={"start": grid})
     from_starts, _ = pushed.reset(

@@ -27,6 +27,8 @@ ATTRACTION_TOLERANCE = 0.05
 """Distance from the orbit that counts as being on it, as a fraction of the box's diagonal."""
 FIRST_PEAK = 0.9
 """A peak of the autocorrelation counts from this fraction of the highest one on."""
+LEAST_PEAK = 0.5
+"""A peak near the period that is known counts from this fraction of the highest one on."""
 AT_REST = 1e-6
 """A signal with a smaller deviation than this fraction of the orbit's size has no period."""
 
@@ -102,7 +104,9 @@ def period(
         Of the demonstrations, in units of length: a trajectory that deviates from its mean by less
         than a millionth of it is at rest. By default only what is exactly constant is.
     about
-        Where given, the highest of the peaks between 2/3 and 3/2 of this period is taken, in s.
+        Where given, in s: the highest of the peaks between 2/3 and 3/2 of it is taken, unless a
+        shorter one reaches 0.9 of it (what turns several times meanwhile is no slower for it), or
+        it is below half of the highest of all.
 
     Returns
     -------
@@ -132,13 +136,15 @@ def period(
     both = total[n - lags] + total[n] - total[lags]
     r = 2 * products / np.where(both > 0, both, 1.0)
     peaks = 1 + np.flatnonzero((r[1:-1] > r[:-2]) & (r[1:-1] >= r[2:]) & (r[1:-1] > 0))
-    if about is not None:
-        ratio = peaks * step / positive(about, "about")
-        peaks = peaks[(ratio >= 2 / 3) & (ratio <= 3 / 2)]
     if len(peaks) == 0:
         return np.inf
-    least = 1.0 if about is not None else FIRST_PEAK
-    k = int(peaks[r[peaks] >= least * r[peaks].max()][0])
+    highest = r[peaks].max()
+    if about is not None:
+        ratio = peaks * step / positive(about, "about")
+        near = peaks[(ratio >= 2 / 3) & (ratio <= 3 / 2)]
+        if len(near) and (meant := r[near].max()) >= LEAST_PEAK * highest:
+            peaks, highest = peaks[peaks <= near[r[near].argmax()]], meant
+    k = int(peaks[r[peaks] >= FIRST_PEAK * highest][0])
     before, here, after = r[k - 1 : k + 2]
     bend = before - 2 * here + after
     return float(k + (0.5 * (before - after) / bend if bend < 0 else 0.0)) * step

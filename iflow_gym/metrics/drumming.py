@@ -366,14 +366,20 @@ def rhythm(scores: Sequence[tuple[ArrayLike, ArrayLike]]) -> FloatArray:
 
 
 def rhythm_f1(
-    phases: ArrayLike, hit_times: ArrayLike, hit_drums: ArrayLike, tolerance: float = TOLERANCE
+    phases: ArrayLike,
+    hit_times: ArrayLike,
+    hit_drums: ArrayLike,
+    period: float,
+    duration: float,
+    tolerance: float = TOLERANCE,
 ) -> float:
     r"""F1 of the hits against a rhythm that goes round at the performance's own tempo.
 
     The notes are at s + (k + phi_d) T^ for all k, with T^ the median interval between successive
-    hits of one drum, from the first hit to the last, and the shift s that matches best. So a steady
-    drummer of the right rhythm scores 1 at any tempo (`tempo_error` says how far off that is), and
-    one who is uneven, misses, doubles, or hits the drums at wrong times of the round does not.
+    hits of one drum, from the first hit to the end, and the shift s that matches best. So a steady
+    drummer of the right rhythm scores 1 at any tempo up to twice or half as fast (`tempo_error`
+    says how far off it is), and one who is uneven, misses, doubles, stops, or hits the drums at
+    wrong times of the round does not.
 
     Parameters
     ----------
@@ -381,11 +387,16 @@ def rhythm_f1(
         When in a round each drum is hit, shape (n_drums,), as `rhythm` gives it.
     hit_times, hit_drums, tolerance
         As in `match`.
+    period
+        Of a round of the demonstrations, in s.
+    duration
+        Of the performance, in s: notes are due until its end.
 
     Returns
     -------
     float
-        In [0, 1]; 0 where no drum was hit twice.
+        In [0, 1]; 0 where no drum was hit twice, where the tempo is beyond twice or half the
+        demonstrations', and where the first hit comes after more than two rounds.
 
     Raises
     ------
@@ -394,17 +405,20 @@ def rhythm_f1(
     """
     shares = np.asarray(phases, dtype=np.float64)
     times, drums = _played(hit_times, hit_drums, "hit")
-    period = _round(times, drums)
-    if period is None:
+    known, end = positive(period, "period"), positive(duration, "duration")
+    found = _round(times, drums)
+    if found is None or not 0.5 <= found / known <= 2.0 or times.min() > 2 * known:
         return 0.0
     best = 0.0
     first, last = times.min(), times.max()
-    rounds = np.arange(-1, np.ceil((last - first) / period) + 2)
+    rounds = np.arange(-1, np.ceil((max(end, last) - first) / found) + 2)
     notes_on = np.tile(np.arange(len(shares)), len(rounds))
+    # A note in the last moment may still be played after it.
+    until = max(end - tolerance, last + tolerance)
     for time, drum in zip(times.tolist(), drums.tolist(), strict=True):
-        start = first + (time - shares[drum] * period - first) % period
-        notes_at = (start + (rounds[:, None] + shares) * period).ravel()
-        due = (notes_at >= first - tolerance) & (notes_at <= last + tolerance)
+        start = first + (time - shares[drum] * found - first) % found
+        notes_at = (start + (rounds[:, None] + shares) * found).ravel()
+        due = (notes_at >= first - tolerance) & (notes_at <= until)
         best = max(best, hit_f1(notes_at[due], notes_on[due], times, drums, tolerance))
     return best
 

@@ -98,7 +98,14 @@ class TestPeriod:
         twice = 1 + 0.6 * np.cos(angle / 2)
         loop = twice[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         assert cycles.period(loop, DT, about=1.1 * PERIOD) == pytest.approx(PERIOD, rel=2e-2)
-        assert cycles.period(loop, DT, about=0.2 * PERIOD) == np.inf
+        assert cycles.period(loop, DT, about=2 * PERIOD) == pytest.approx(2 * PERIOD, rel=2e-2)
+        # Nothing recurs near it: as if nothing were known.
+        assert cycles.period(loop, DT, about=0.2 * PERIOD) == cycles.period(loop, DT)
+
+    def test_what_turns_twice_meanwhile_is_faster(self):
+        assert cycles.period(circle(period=PERIOD / 2), DT, about=PERIOD) == pytest.approx(
+            PERIOD / 2, rel=1e-2
+        )
 
     def test_what_never_repeats_has_none(self):
         assert cycles.period(np.ones((100, 2)), DT) == np.inf

@@ -336,21 +336,30 @@ class TestRhythm:
     def test_a_steady_drummer_is_right_at_any_tempo(self):
         times, drums = STEADY
         for tempo in (0.7, 1.0, 1.4):
-            assert m.rhythm_f1([0.0, 0.4], tempo * times + 9.0, drums) == 1.0
+            assert m.rhythm_f1([0.0, 0.4], tempo * times + 9.0, drums, 5.0, 30 * tempo + 9) == 1.0
 
     def test_what_is_uneven_missing_doubled_or_misplaced_costs(self):
         times, drums = STEADY
-        assert m.rhythm_f1([0.0, 0.6], times, drums) == pytest.approx(0.5, abs=0.05)
-        assert m.rhythm_f1([0.0, 0.4], times[drums == 0], drums[drums == 0]) == pytest.approx(
-            2 * 6 / (6 + 11)
-        )
+        assert m.rhythm_f1([0.0, 0.6], times, drums, 5.0, 30.0) == pytest.approx(0.5, abs=0.05)
+        one = times[drums == 0], drums[drums == 0]
+        assert m.rhythm_f1([0.0, 0.4], *one, 5.0, 30.0) == pytest.approx(2 * 6 / (6 + 12))
         doubled = np.concatenate([times, times + 0.2]), np.concatenate([drums, drums])
-        assert m.rhythm_f1([0.0, 0.4], *doubled) < 0.7
+        assert m.rhythm_f1([0.0, 0.4], *doubled, 5.0, 30.0) < 0.7
         wild = times + np.random.default_rng(0).uniform(-0.6, 0.6, len(times))
-        assert m.rhythm_f1([0.0, 0.4], wild, drums) < 0.6
+        assert m.rhythm_f1([0.0, 0.4], wild, drums, 5.0, 30.0) < 0.6
 
     def test_silence_and_a_single_round_have_none(self):
-        assert m.rhythm_f1([0.0, 0.4], [], []) == 0.0
-        assert m.rhythm_f1([0.0, 0.4], [1.0, 3.0], [0, 1]) == 0.0
+        assert m.rhythm_f1([0.0, 0.4], [], [], 5.0, 30.0) == 0.0
+        assert m.rhythm_f1([0.0, 0.4], [1.0, 3.0], [0, 1], 5.0, 30.0) == 0.0
+
+    def test_who_stops_or_rattles_is_no_drummer(self):
+        times, drums = STEADY
+        early = times < 10
+        f1 = m.rhythm_f1([0.0, 0.4], times[early], drums[early], 5.0, 30.0)
+        assert f1 == pytest.approx(2 * 4 / (4 + 12))
+        rattle = 0.12 * np.arange(250), np.arange(250) % 2
+        assert m.rhythm_f1([0.0, 0.5], *rattle, 5.0, 30.0) == 0.0
+
+    def test_a_score_of_one_round_has_none(self):
         with pytest.raises(ValueError, match="a shorter one has no rhythm"):
             m.rhythm([([1.0, 3.0], [0, 1])])
