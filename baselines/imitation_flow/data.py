@@ -115,7 +115,10 @@ class Task:
         """Seconds of a round of each recording: its own, or the given where it has too few."""
         inverse = np.linalg.inv(self.principal_axes).T
         steps = [(h, m.period) for m in self.motions for h in m.dt]
-        found = frequency.periods([path @ inverse for path in self.centred])
+        found = frequency.periods(
+            [path @ inverse for path in self.centred],
+            [float(given or 0.0) / h for h, given in steps],
+        )
         return [
             h * samples if samples is not None else float(given or 0.0)
             for samples, (h, given) in zip(found, steps, strict=True)

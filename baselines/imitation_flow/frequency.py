@@ -62,14 +62,22 @@ def winding_number(path: FloatArray) -> float:
     return float(turned[-1] - turned[0]) / (2 * math.pi)
 
 
-def periods(paths: Sequence[FloatArray]) -> list[float | None]:
+def periods(
+    paths: Sequence[FloatArray], given: Sequence[float] | None = None
+) -> list[float | None]:
     """Return the period of each recording (T, d) of a motion in samples; None for one too short.
 
     The origin is the centre, and the first axis the one of largest spread. Which harmonic of the
-    rounds is the main one is a matter of the motion's shape: the recordings' median tells.
+    rounds is the main one is a matter of the motion's shape: the recordings' median tells. Where a
+    period of each recording is `given`, in samples, it is the harmonic that the given ones say: a
+    coil, or a rosette, turns several times a round.
     """
-    long = [path for path in paths if len(path) >= SHORTEST]
-    harmonic = float(np.median([_harmonic(path) for path in long])) if long else 1.0
+    long = [i for i, path in enumerate(paths) if len(path) >= SHORTEST]
+    if given is None:
+        found = [float(_harmonic(paths[i])) for i in long]
+    else:
+        found = [max(1.0, round(given[i] * main_frequency(paths[i][:, 0]))) for i in long]
+    harmonic = float(np.median(found)) if found else 1.0
     return [_period(path, harmonic) if len(path) >= SHORTEST else None for path in paths]
 
 

@@ -53,16 +53,16 @@ class Hand:
     """Curvature, times height, below which the hand becomes no faster."""
     lag: float = 0.25
     """Time constant of the variation, in rounds."""
-    aim: Variation = Variation(0.011, 0.004)
+    aim: Variation = Variation(0.011, 0.005)
     """Of each via point, a coordinate; neighbours on the outline are aimed at alike."""
-    size: Variation = Variation(0.014, 0.008)
+    size: Variation = Variation(0.014, 0.01)
     """Of the logarithm of the size."""
-    slant: Variation = Variation(0.012, 0.008)
+    slant: Variation = Variation(0.012, 0.01)
     """In radians; a shear, as slant is in handwriting."""
-    place: Variation = Variation(0.014, 0.008)
+    place: Variation = Variation(0.014, 0.01)
     """Of the outline's centre, a coordinate."""
     tempo: Variation = Variation(0.09, 0.05)
-    """Of the logarithm of the rate."""
+    """Of the logarithm of the rate; between recordings, of its mean."""
     pulse: float = 0.14
     """Root mean square of the rate's fluctuation in the band of tremor, of the rate."""
     tremor: float = 0.0008
@@ -156,8 +156,8 @@ def trace(
     n_rounds : int
         The recording ends with the first sample that completes so many rounds.
     tempo : float
-        How far the recording's own tempo is from the usual one, in standard deviations of
-        `Hand.tempo` between recordings.
+        How far the recording's mean tempo is from the usual one, in standard deviations of
+        `Hand.tempo` between recordings: the n rounds last n period exp(-tempo deviation).
     seed : tuple of ints
         Of the random numbers.
 
@@ -174,8 +174,7 @@ def trace(
         _wander(_uniform(bits, (2 * n_via + 5, n + round(16 * lag))), lag)[:, -n:],
         [2, 2 + 2 * n_via],
     )
-    constants = _uniform(bits, (2 * n_via + 6,))
-    constants[-2] = tempo
+    constants = _uniform(bits, (2 * n_via + 5,))
     tremor = _band(
         _uniform(bits, (3, n + round(4 / (hand.tremor_bandwidth * dt)))),
         hand.tremor_frequency * dt,
@@ -188,14 +187,17 @@ def trace(
     shift = varied(place, constants[:2], hand.place)
     aims = varied(aim, constants[2 : 2 + 2 * n_via], hand.aim).reshape(2, n_via, n)
     aims = (2 * aims + np.roll(aims, 1, axis=1) + np.roll(aims, -1, axis=1)) / np.sqrt(6)
-    size, slant, pace = (
+    size, slant = (
         varied(process, constant, amount)
         for process, constant, amount in zip(
-            rest, constants[2 + 2 * n_via :], (hand.size, hand.slant, hand.tempo), strict=False
+            rest[:2], constants[-3:-1], (hand.size, hand.slant), strict=True
         )
     )
     start = constants[-1] / np.sqrt(12) + 0.5
-    rate = np.exp(pace + hand.pulse * tremor[2]) * dt / period
+    rate = np.exp(hand.tempo.within * rest[2] + hand.pulse * tremor[2])
+    passed = np.cumsum(rate[MARGIN:]) - rate[MARGIN]
+    last = n_rounds * period / dt * np.exp(-hand.tempo.between * tempo)
+    rate *= n_rounds / np.interp(last, np.arange(len(passed)), passed)
     phase = start + np.cumsum(rate) - rate[: MARGIN + 1].sum()  # sample MARGIN is at the start
     end = int(np.argmax(phase >= start + n_rounds)) + 1 + MARGIN
     height = outline.height
@@ -204,6 +206,15 @@ def trace(
     path[0] += slant * path[1]
     path = np.exp(size) * path + height * (shift + hand.tremor * tremor[:2])
     return Recording(path.T[:end], phase[:end])
+
+
+def stratified(n: int, seed: tuple[int, ...]) -> FloatArray:
+    """Return uniform numbers of variance 1, one from each nth of their range, in random order.
+
+    The standard deviation of their mean is n^(-3/2); that of independent ones would be n^(-1/2).
+    """
+    order, within = _uniform(np.random.PCG64(np.random.SeedSequence(seed)), (2, n))
+    return np.asarray((2 * np.argsort(order) + 1 - n) * np.sqrt(3) / n + within / n)
 
 
 def central_difference(positions: FloatArray, dt: float) -> FloatArray:

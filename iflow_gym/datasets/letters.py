@@ -24,6 +24,7 @@ from iflow_gym.datasets.handwriting import (
     Recording,
     central_difference,
     steadier,
+    stratified,
     trace,
 )
 from iflow_gym.demonstrations import Demonstrations
@@ -68,13 +69,13 @@ _VIA = {
 _PERIODS = {"I": 0.8, "R": 2.6, "O": 0.75, "S": 1.0}
 """Usual duration of a round in seconds."""
 
+_DRAWS = {("R", 6): 1, ("R", 11): 1, ("R", 17): 1, ("S", 6): 2}
+"""Recordings drawn again, so many times: in the draws before, a round's end crossed its start."""
+
 HAND = Hand()
 
-_STEADINESS = {"I": 0.65, "R": 1.05, "O": 0.7, "S": 1.0}
-"""How much the path varies, of what `HAND` varies: round letters are traced more steadily."""
-
-_TEMPOS = (4, 7, 0, 9, 2, 5, 8, 1, 6, 3)
-"""Ranks of the recordings' own tempos among each ten."""
+_VARIATION = {"I": 0.65, "R": 1.1, "O": 0.7, "S": 1.0}
+"""How much the path varies, of what `HAND`'s does: simple letters are traced more steadily."""
 
 
 def outline(letter: str) -> Outline:
@@ -107,7 +108,13 @@ def load_letter(letter: str) -> Demonstrations:
 
 def recordings(letter: str) -> list[Recording]:
     """Return what the hand did in full precision, with the phase of each sample in rounds."""
-    shape, hand = outline(letter), steadier(HAND, _STEADINESS[letter])
+    shape, hand = outline(letter), steadier(HAND, _VARIATION[letter])
+    parts = (N_RECORDINGS - N_HELD_OUT, N_HELD_OUT)
+    tempos = [
+        tempo
+        for k, n in enumerate(parts)
+        for tempo in stratified(n, (ord(letter), VERSION, N_RECORDINGS + k))
+    ]
     return [
         trace(
             shape,
@@ -115,23 +122,11 @@ def recordings(letter: str) -> list[Recording]:
             period=_PERIODS[letter],
             n_rounds=N_ROUNDS,
             dt=DT,
-            tempo=_tempo(i),
-            seed=(ord(letter), VERSION, i),
+            tempo=tempos[i],
+            seed=(ord(letter), VERSION, i, _DRAWS.get((letter, i), 0)),
         )
         for i in range(N_RECORDINGS)
     ]
-
-
-def _tempo(index: int) -> float:
-    """Return a recording's own tempo, in standard deviations from the usual one.
-
-    Stratified, one from each tenth of a uniform distribution of variance 1: so that each ten, the
-    ones to fit on and those held out, have the usual tempo on average. Ten drawn at random would
-    differ from it by a third of a deviation, and what a method makes of unseen recordings' tempo
-    would be the luck of that draw.
-    """
-    rank = _TEMPOS[index % len(_TEMPOS)]
-    return float(np.sqrt(12) * ((rank + 0.5) / len(_TEMPOS) - 0.5))
 
 
 @lru_cache(maxsize=len(LETTERS))

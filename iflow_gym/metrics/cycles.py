@@ -66,8 +66,18 @@ def orbit_hausdorff(orbit: ArrayLike, demonstrations: ArrayLike) -> float:
     .. math:: \max \Big( \max_{x \in O} \min_{y \in D} \lVert x - y \rVert, \;
         \max_{y \in D} \min_{x \in O} \lVert x - y \rVert \Big)
 
-    Parameters, result and errors are those of ``orbit_distance``. Demonstrations that differ among
-    themselves have no orbit at distance 0: half of their greatest spread is the least there is.
+    Demonstrations that differ among themselves have no orbit at distance 0: half of their greatest
+    spread is the least there is.
+
+    Parameters
+    ----------
+    orbit, demonstrations
+        As in ``orbit_distance``, whose errors are raised.
+
+    Returns
+    -------
+    float
+        In units of length; infinity if the orbit is not finite.
     """
     distances = _nearest(orbit, demonstrations)
     return np.inf if distances is None else float(max(d.max() for d in distances))

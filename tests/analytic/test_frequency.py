@@ -51,6 +51,14 @@ def test_a_harmonic_is_told_for_all_recordings_together():
     np.testing.assert_allclose(frequency.periods(paths), [150.0, 130.0, 110.0, 130.0], rtol=2e-3)
 
 
+def test_the_given_period_tells_what_turns_several_times_a_round():
+    angle = 2 * np.pi * np.arange(900) / 200
+    rosette = np.stack([0.5 * np.cos(angle) + np.cos(5 * angle),
+                        0.5 * np.sin(angle) + np.sin(5 * angle)], axis=1)  # fmt: skip
+    (found,) = frequency.periods([rosette], given=[210.0])
+    assert found == pytest.approx(200.0, rel=2e-3)
+
+
 def test_less_than_a_round_and_a_half_says_nothing():
     assert frequency.periods([ring(130, 100.0), ring(5, 100.0)]) == [None, None]
 
@@ -64,7 +72,7 @@ def recordings(periods, given, dt=0.01, n_rounds=3.3):
 
 class TestTempo:
     def test_each_recording_is_timed_by_its_own_rounds(self):
-        task = Task([recordings([1.0, 1.5, 2.0], given=5.0)])
+        task = Task([recordings([1.0, 1.5, 2.0], given=1.3)])
         frame = Frame.of(task)
         np.testing.assert_allclose(task.periods, [1.0, 1.5, 2.0], rtol=5e-3)
         assert frame.time == pytest.approx(1.5, rel=5e-3)

@@ -186,7 +186,7 @@ def test_different_seeds_give_different_starts(env_id):
 @every_id
 def test_replay_gives_the_recordings_back(env_id):
     env = make(env_id).unwrapped
-    demos = env.demonstrations
+    demos = env.demonstrations.shown
     dataset = env.get_dataset()
     expected = np.concatenate([p[1:] for p in demos.positions])
     np.testing.assert_allclose(dataset["next_observations"], expected, rtol=0, atol=1e-9)
@@ -215,11 +215,17 @@ def test_dataset_actions_reproduce_its_observations(env_id, mode):
 
 @every_id
 def test_force_mode_tracks_the_recordings(env_id):
-    """Default mass, damping and force are chosen so: within half a percent of the diagonal."""
+    """Default mass, damping and force are chosen so: within half a percent of the diagonal.
+
+    Within one for letters, which are traced in pulses of ten samples.
+    """
     env = make(env_id, control_mode="force").unwrapped
-    starts = np.concatenate([p[:-1] for p in env.demonstrations.positions])
+    starts = np.concatenate([p[:-1] for p in env.demonstrations.shown.positions])
     positions = env.get_dataset()["observations"][:, : env.n_dims]
-    assert np.linalg.norm(positions - starts, axis=1).max() < 0.005 * env.task.diagonal
+    assert (
+        np.linalg.norm(positions - starts, axis=1).max()
+        < (0.005 if env.demonstrations.period is None else 0.01) * env.task.diagonal
+    )
 
 
 def test_dataset_of_the_generalisation_split():
@@ -515,7 +521,8 @@ def test_rewards_of_replaying_standing_and_oscillating(env_id):
     data = env.get_dataset()
     ends = np.flatnonzero(data["timeouts"]) + 1
     replay = [r.mean() for r in np.split(data["rewards"], ends[:-1])]
-    assert min(replay) >= 0.9
+    # A round of a letter lies among others of another tempo, which a cycle's reward compares with.
+    assert min(replay) >= (0.9 if env.demonstrations.period is None else 0.75)
     assert np.abs(data["rewards"]).max() <= 1
 
     envs = gymnasium.make_vec(env_id, num_envs=len(env.demonstrations), **golden.arguments(env_id))
@@ -527,10 +534,10 @@ def test_rewards_of_replaying_standing_and_oscillating(env_id):
             envs.reset(options={"demonstration": indices, "start": start})
             sign = np.where(np.arange(100) % 2, -1, 1)
             rewards = np.mean([envs.step(s * action)[1] for s in sign], axis=0)
-            far = (
-                np.linalg.norm(start - env.demonstrations.attractor, axis=1)
-                > 0.1 * envs.task.diagonal
-            )
+            far = np.ones(len(start), dtype=bool)
+            if env.demonstrations.goal is not None:
+                away = np.linalg.norm(start - env.demonstrations.goal, axis=1)
+                far = away > 0.1 * envs.task.diagonal
             assert np.abs(rewards[far]).max() <= (0.05 if not action.any() else 0.1)
 
 

@@ -249,6 +249,9 @@ def test_a_cycle_comes_back_from_its_file(name, tmp_path):
 @every_rhythmic
 def test_a_period_in_another_unit_is_told(name):
     shown = ring()
-    wrong = Demonstrations.from_arrays(list(shown.positions), dt=0.02, period=0.0015)
+    for period in (0.0015, 1500.0):
+        with pytest.raises(ValueError, match="check the units of period and dt"):
+            Demonstrations.from_arrays(list(shown.positions), dt=0.02, period=period)
+    coarse = Demonstrations.from_arrays([p[::15] for p in shown.positions], dt=0.3, period=1.5)
     with pytest.raises(ValueError, match="at least 8 samples a period"):
-        load_method(name)().fit(wrong, seed=0)
+        load_method(name)().fit(coarse, seed=0)
