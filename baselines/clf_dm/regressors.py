@@ -41,12 +41,19 @@ SVR_TUBE = 0.02
 SVR_COSTS, SVR_LENGTHS = (10.0, 1000.0), (0.25, 0.5, 1.0)
 """C, and the kernel's length in the same units: all pairs are tried."""
 
+GPR_STRETCHES = (1.0, 1.5, 2.5)
+"""Lengths of the kernel over the likeliest ones: all are tried."""
+
 HOMING = 1.0
 """Rate at which a state far from the samples nears the goal, in root mean square speeds a root mean
 square distance."""
 
 BROAD_PRIOR, BROAD_SPREAD = 1e-2, 2.0
 """Weight of the broad Gaussian, and its standard deviation in root mean square distances."""
+
+
+KernelSum = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Points, weights, bias and lengths of a `KernelRegressor`, in units of root mean squares."""
 
 
 class Regressor(Protocol):
@@ -180,7 +187,7 @@ def fit_regressors(
     beyond = few[:, d:] + HOMING * few[:, :d]
     rate = np.array([HOMING * scale[-1] / scale[0]])
     found = (
-        [_gaussian_process(few[:, :d], beyond)]
+        _gaussian_processes(few[:, :d], beyond)
         if config.regressor == "gpr"
         else [
             _support_vectors(few[:, :d], beyond, cost, length)
@@ -254,20 +261,22 @@ def _homing(
     )
 
 
-def _gaussian_process(
-    x: FloatArray, v: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Fit one process to all coordinates, its hyperparameters by the likelihood, as `GPR` does."""
+def _gaussian_processes(x: FloatArray, v: FloatArray) -> list[KernelSum]:
+    """Fit one process to all coordinates, its hyperparameters by the likelihood, as `GPR` does.
+
+    Again with longer kernels, which the likelihood may not want and a motion may.
+    """
     signal, lengths, noise = maximise_likelihood(x, v)
-    scaled = x / lengths
-    gram = signal * np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean")) + noise * np.eye(len(x))
-    weights = signal * np.asarray(np.linalg.solve(gram, v), dtype=np.float64)
-    return x, weights, np.zeros(v.shape[1]), lengths
+    found: list[KernelSum] = []
+    for stretch in GPR_STRETCHES:
+        scaled = x / (stretch * lengths)
+        gram = signal * np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean"))
+        weights = signal * np.asarray(np.linalg.solve(gram + noise * np.eye(len(x)), v))
+        found.append((x, weights, np.zeros(v.shape[1]), stretch * lengths))
+    return found
 
 
-def _support_vectors(
-    x: FloatArray, v: FloatArray, cost: float, length: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _support_vectors(x: FloatArray, v: FloatArray, cost: float, length: float) -> KernelSum:
     """Fit one machine for each coordinate."""
     weights, bias = np.zeros_like(v), np.zeros(v.shape[1])
     for i in range(v.shape[1]):
