@@ -38,7 +38,7 @@ SHA256 = {
     "I": "7490922d813df8d1ca2e26f48aaa3f83a4e2fcc3a862aecae683bac0d0021ee8",
     "R": "5a37d8b5d36d20c5d33079b7244c9deb8dbb3250bc5aac51e6b737d8d310e096",
     "O": "515a1ff51d6719f3b6c7fd33207a7ccd3a23ae1d5b00103f23df2720a68b51a4",
-    "S": "82da70ddf70c80fe4008bcf38a2713e66254be734d506ecc58b41ffb2ed57180",
+    "S": "4fe89c7df863f73c03f5fd621a2851a6a67cfa34e2a292014cb0cdfab77ffbae",
 }
 """Of version 0: other numbers are another version."""
 

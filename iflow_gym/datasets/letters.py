@@ -74,7 +74,7 @@ _DRAWS = {("R", 6): 1, ("R", 11): 1, ("R", 17): 1, ("S", 6): 2}
 
 HAND = Hand()
 
-_VARIATION = {"I": 0.65, "R": 1.1, "O": 0.7, "S": 1.0}
+_VARIATION = {"I": 0.65, "R": 1.1, "O": 0.7, "S": 0.92}
 """How much the path varies, of what `HAND`'s does: simple letters are traced more steadily."""
 
 
