@@ -17,7 +17,7 @@ from rich.console import Console
 
 from iflow_gym.baselines.run_all import RunOptions, run_all
 from iflow_gym.baselines.runner import plan, pool
-from iflow_gym.baselines.runner.plan import demonstrations_of
+from iflow_gym.baselines.runner.plan import task_of
 from iflow_gym.baselines.runner.presets import load_preset
 from iflow_gym.baselines.runner.work import time_limit_of_batch
 from iflow_gym.results import read_result, read_results
@@ -137,7 +137,7 @@ def toys(tmp_path, monkeypatch):
     sys.modules.pop("toys", None)
     for name in MOTIONS:
         gymnasium.registry.pop(f"iflow/{name}", None)
-        demonstrations_of.cache_clear()
+        task_of.cache_clear()
 
 
 def run(output, *methods, envs=MOTIONS, time_limit=120.0, jobs=2, **settings):

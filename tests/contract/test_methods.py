@@ -323,6 +323,10 @@ def test_a_small_step_goes_along_the_field(name, shape):
     system = fitted(name, shape)
     demonstrations = thinned(shape)
     x = np.concatenate(demonstrations.positions)[::7]
+    if demonstrations.goal is not None:
+        # Next to the goal a step may be corrected as one of some length, and jumps to it.
+        away = np.linalg.norm(x - demonstrations.goal, axis=1)
+        x = x[away > 5e-3 * demonstrations.bounding_box.diagonal]
     dt = 1e-5 * demonstrations.durations.mean()
     np.testing.assert_allclose(
         (system.step(x, dt) - x) / dt,
