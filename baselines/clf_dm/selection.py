@@ -18,7 +18,7 @@ from iflow_gym.baselines.clf_dm.regressors import Regressor
 from iflow_gym.demonstrations import FloatArray
 from iflow_gym.metrics import frechet
 
-STEPS = 500
+STEPS = 333
 """About so many steps has a reproduction in the first pass."""
 
 COMPARED = 125, 250
