@@ -1,4 +1,4 @@
-"""The reward of the point-mass environments, progress along the demonstrations, and their aim.
+"""The reward of the environments, progress along the demonstrations, and their aim.
 
 Let m = (x + x') / 2 be the middle of a step, k the demonstrations' sample nearest to m, p_k its
 position, t_k the unit tangent and s_k the speed there. With w a twentieth of the diagonal of the
@@ -45,6 +45,9 @@ WIDTH = 0.05
 
 SLOWEST = 1e-6
 """Samples slower than this fraction of the peak speed have no direction and are left out."""
+
+TURNING = 0.01
+"""So are, of a motion that repeats, those that are slower than this: it turns round there."""
 
 _TINY = 1e-12
 """Keeps 0 / 0 away where the guide vanishes."""
@@ -195,7 +198,7 @@ class CycleGuide(Guide):
         points, flow = np.concatenate(demos.positions), np.concatenate(demos.velocities)
         rounds = np.concatenate(common_phases(demos)) % 1.0
         speeds = np.linalg.norm(flow, axis=1)
-        moving = speeds > SLOWEST * demos.peak_speed
+        moving = speeds > TURNING * demos.peak_speed
         points, speeds = points[moving], speeds[moving]
         more = np.column_stack([rounds[moving], points])
         return points, flow[moving] / speeds[:, None], speeds, more

@@ -41,7 +41,6 @@ CORE = (
 NOT_SCORED = (
     "iflow_gym",
     "iflow_gym.datasets",
-    "iflow_gym.envs.drumming.progress",
     "iflow_gym.envs.drumming.rendering",
     "iflow_gym.envs.guide",
     "iflow_gym.envs.nearest",

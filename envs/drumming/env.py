@@ -23,10 +23,10 @@ from iflow_gym.envs.drumming.arguments import (
 )
 from iflow_gym.envs.drumming.arms import Arms
 from iflow_gym.envs.drumming.control import CONTROL_DT
-from iflow_gym.envs.drumming.progress import Progress, progress_along
 from iflow_gym.envs.drumming.scene import TORQUE_LIMITS
 from iflow_gym.envs.drumming.simulation import Simulation, UnreachableError
-from iflow_gym.envs.dynamics import scaled_into_box
+from iflow_gym.envs.dynamics import FLOATS, scaled_into_box
+from iflow_gym.envs.guide import Guide, guide_for
 from iflow_gym.envs.task import START_NOISE, Push
 from iflow_gym.metrics import Motion
 from iflow_gym.metrics.drumming import Hit, implied_score
@@ -97,8 +97,10 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     0.7, and at most 0.77 m from (0.36, 0, -0.03).
 
     ## Rewards
-    Progress along the demonstrations, in [-1, 1]: about 1 a step for a replay, 0 for standing
-    still, -1 for going back. `iflow_gym.envs.drumming.progress` has the equation.
+    That of the point mass for a motion that repeats, in [-1, 1] (`iflow_gym.envs.guide`): about 1 a
+    step for a replay, 0 for standing still, -1 for going back. On the heads, where the way down and
+    the way up lie side by side, the nearest sample may belong to the other one, and a replay has
+    some steps that cost.
 
     ## Starting State
     The first sample of a demonstration drawn uniformly, plus Gaussian noise with a standard
@@ -133,6 +135,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     | --- | --- | --- |
     | `is_success` | bool | within 5 % of the bounding box's diagonal of the demonstrations |
     | `distance_to_orbit` | float | m from the demonstrations' nearest sample |
+    | `phase` | float | of that sample, in rounds from 0 to 1 |
     | `time` | float | seconds since the reset |
     | `dt` | float | seconds a step |
     | `demonstration` | int | index of the demonstration, -1 for a start of the caller's choice |
@@ -207,7 +210,6 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         self.width, self.height = int(width), int(height)
         self.diagonal = self._demonstrations.bounding_box.diagonal
         self.simulation = Simulation(self.drums)
-        self._progress: Progress | None = None
         size = 3 if control_mode == "velocity" else len(TORQUE_LIMITS)
         self.action_space = cast(
             "spaces.Space[FloatArray]", spaces.Box(-1.0, 1.0, (size,), np.float32)
@@ -379,9 +381,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._running = True
         self._tip = self.simulation.tip
         self._trail = [self._tip] if self.render_mode is not None else []
-        return self._observation(), self._info(
-            self._tip, 1.0, (), self._field().distance(self._tip)
-        )
+        return self._observation(), self._info(self._tip, 1.0, (), self._measures(self._tip))
 
     def _place_at_demonstration(self, index: int, *, noisy: bool) -> None:
         first = self.demonstrations.positions[index][0]
@@ -446,31 +446,36 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         is_force = isinstance(self.perturbation, ForcePush)
         hits = simulation.advance(torque, self._push if pushing and is_force else None)
         reached = simulation.tip
-        reward, distance = self._field().of_step(before, reached, CONTROL_DT)
+        measures = self._measures(reached)
+        reward = self._guide.reward(
+            FLOATS, before.tolist(), reached.tolist(), CONTROL_DT, measures[0]
+        )
         self._tip = reached
         if pushing and not is_force:
             simulation.displace(self._push)
             self._tip = simulation.tip
-            distance = self._field().distance(self._tip)
+            measures = self._measures(self._tip)
         truncated = self._count >= self._length
         if truncated:
             hits += simulation.pending_hits()
         if self.render_mode is not None:
             self._trail.append(self._tip)
-        info = self._info(reached if target is None else target, scale, tuple(hits), distance)
+        info = self._info(reached if target is None else target, scale, tuple(hits), measures)
         return self._observation(), reward, False, truncated, info
 
-    def _field(self) -> Progress:
-        if self._progress is None:
-            self._progress = progress_along(self.demonstrations)
-        return self._progress
+    @property
+    def _guide(self) -> Guide:
+        return guide_for(self.demonstrations.shown)
+
+    def _measures(self, tip: FloatArray) -> tuple[float, ...]:
+        return self._guide.measures(FLOATS, tip.tolist())
 
     def _info(
-        self, target: FloatArray, scale: float, hits: tuple[Hit, ...], distance: float
+        self, target: FloatArray, scale: float, hits: tuple[Hit, ...], measures: tuple[float, ...]
     ) -> dict[str, Any]:
         return {
-            "is_success": distance <= ON_ORBIT * self.diagonal,
-            "distance_to_orbit": distance,
+            "is_success": measures[0] <= ON_ORBIT * self.diagonal,
+            **dict(zip(self._guide.measured, measures, strict=True)),
             "time": self._count * CONTROL_DT,
             "dt": CONTROL_DT,
             "demonstration": self._index,
