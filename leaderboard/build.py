@@ -169,7 +169,7 @@ def _headline_figures(
     ]
     sheets = {
         "methods": (method_panels(board, results_folder), 3.0),
-        "fields": (shape_panels(every_shape, results_folder), 2.2),
+        "fields": (shape_panels(every_shape, results_folder), 1.9),
     }
     for name, (panels, size) in sheets.items():
         if any(panel.system is not None for panel in panels):
