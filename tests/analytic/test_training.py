@@ -7,6 +7,7 @@ import torch
 from iflow_gym.baselines.imitation_flow import ImitationFlow, guard, training
 from iflow_gym.baselines.imitation_flow.guard import TrainingError
 from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.datasets.letters import load_letter
 from iflow_gym.metrics import rmse
 
 SMALL = {"n_layers": 2, "n_times": 5, "n_pairs": 14}
@@ -88,3 +89,38 @@ def test_training_that_diverges_for_good_is_an_error(monkeypatch):
 def test_weights_must_be_finite(setting):
     with pytest.raises(ValueError, match=f"finite {setting} >= 0, got nan"):
         ImitationFlow(**{setting: float("nan")})
+
+
+@pytest.fixture
+def double_precision():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+CASES = [
+    (emission, name, {"objective": objective})
+    for emission in ("coupling", "autoregressive", "spline")
+    for name, objective in (("Angle", "reproduction"), ("Angle", "paper"), ("I", "reproduction"))
+]
+
+
+def short_fit(emission, name, settings):
+    motion = load_letter(name) if len(name) == 1 else load_lasa(name)
+    method = ImitationFlow(emission=emission, n_steps=20, **SMALL, **settings)
+    return method.fit(motion.subset(range(3)), seed=0)
+
+
+@pytest.fixture(scope="module")
+def in_single_precision():
+    return [short_fit(*case) for case in CASES]
+
+
+@pytest.mark.parametrize("case", range(len(CASES)), ids=["-".join(c[:2]) for c in CASES])
+def test_the_processs_default_precision_changes_nothing(
+    case, in_single_precision, double_precision
+):
+    system, expected = short_fit(*CASES[case]), in_single_precision[case]
+    for name, array in expected._parameters.items():
+        np.testing.assert_array_equal(system._parameters[name], array, err_msg=name)
