@@ -329,7 +329,7 @@ class ImitationFlow(DynamicalSystem):
 
         Inputs ``x`` (n, d) and ``dt`` (n,) or (1,) in seconds, outputs ``x_next`` and ``velocity``
         (n, d), float64; without `velocity` a step takes half the time. See `export` for more.
-        Needs the extra ``onnx``, and coupling layers.
+        Needs the extra ``onnx``.
         """
         self._require_fit()
         reason = self.guarantee
