@@ -181,7 +181,7 @@ def _train(
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
         adam.step(step, _stage(config, step, data), loss)
         if len(adam.failures) == len(tasks):
-            return list(adam.failures.values())
+            return [adam.failures[m] for m in range(len(tasks))]
     adam.finish(n_steps)
     if _stage(config, n_steps, data) == WHOLE:
         _fit_noise(flow, latent, data, rngs)

@@ -134,11 +134,16 @@ def test_failures_in_batches_of_their_own_are_collected(monkeypatch):
 
 
 def test_a_batch_that_fails_whole_ends_at_once(monkeypatch):
-    calls = []
-    disturbed(monkeypatch, [torch.nan, torch.nan], lambda n: calls.append(n) or True)
-    with pytest.raises(PartialFitError, match="2 of 2 motions"):
+    """The second model fails first: each has its own error all the same."""
+    calls, late = [], 4 * guard.WINDOW
+    disturbed(monkeypatch, [torch.nan, 1.0], lambda n: n > late)
+    disturbed(monkeypatch, [1.0, torch.nan], lambda n: calls.append(n) or True)
+    with pytest.raises(PartialFitError, match="2 of 2 motions") as caught:
         fit(n_steps=5000)
-    assert len(calls) == (guard.MOST_RESTARTS + 1) * guard.WINDOW
+    assert len(calls) == late + (guard.MOST_RESTARTS + 1) * guard.WINDOW
+    failures = caught.value.failures
+    assert "on 'LASA-Angle': its training diverged 6 times, last at step 249" in str(failures[0])
+    assert "on 'LASA-Line': its training diverged 6 times, last at step 149" in str(failures[1])
 
 
 def test_a_file_keeps_where_training_was_taken_back(monkeypatch, tmp_path):

@@ -17,7 +17,6 @@ from iflow_gym.baselines.imitation_flow.fields.autoregressive import Autoregress
 from iflow_gym.baselines.imitation_flow.fields.points import (
     PlanePoint,
     Product,
-    Step,
     Vector,
     chain,
     products,
@@ -135,10 +134,8 @@ class SpacePoint:
         """Return h(z)."""
         out, bound, activate = self._out, self._bound, np.tanh
         self._states[0, : self._n_dims] = z
-        step: Step
-        for step, stages in self._steps:
-            after = step.after
-            step.first(step.before, after)
+        for (first, before, after, _, _), stages in self._steps:
+            first(before, after)
             for i, argue, state, units, shown, second, *_ in stages:
                 if argue is not None:
                     argue(state, units)
