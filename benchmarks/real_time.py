@@ -1,12 +1,14 @@
 """A step of one state, and of 1000, by every way to run a flow: microseconds on one thread.
 
-    python benchmarks/real_time.py [--n-layers 24] [--n-dims 2] [--repeats 200] [--compile]
+    python benchmarks/real_time.py [--emission spline] [--n-layers 24] [--n-dims 2] [--compile]
 
 The flows have random weights of a trained flow's size and a linear latent system; all ways compute
 the same step in float64, and the largest difference to the batched NumPy path is printed beside
 the median. ONNX needs the extra ``onnx``; ``--compile`` also tries `torch.compile`, which needs a
-C++ compiler. torch's difference is that of its `matrix_exp`, which is only good to 1e-10 for a
-single float64 matrix of norm 0.01 to 0.05; for a batch of them it is exact to rounding.
+C++ compiler. TorchScript and the compiler are for coupling layers, written out in torch operations;
+the other emissions have the flow that is trained for an eager torch. torch's difference is that of
+its `matrix_exp`, which is only good to 1e-10 for a single float64 matrix of norm 0.01 to 0.05; for
+a batch of them it is exact to rounding.
 """
 
 import io
@@ -23,10 +25,11 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from iflow_gym.baselines.imitation_flow.coupling import CouplingFlow
+from iflow_gym.baselines.imitation_flow.config import Emission, ImitationFlowConfig
+from iflow_gym.baselines.imitation_flow.emissions import make_field, make_flow
 from iflow_gym.baselines.imitation_flow.export import export
-from iflow_gym.baselines.imitation_flow.fields.coupling import CouplingField
 from iflow_gym.baselines.imitation_flow.fields.latents import LinearField
+from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.realtime import MeanDynamics, RealTimeStepper
 
 
@@ -34,8 +37,10 @@ from iflow_gym.baselines.imitation_flow.realtime import MeanDynamics, RealTimeSt
 class Options:
     """What to measure."""
 
+    emission: Emission = "coupling"
+    """Layers of the flow."""
     n_layers: int = 24
-    """Coupling layers."""
+    """How many."""
     n_hidden: int = 16
     """Units in each."""
     n_dims: int = 2
@@ -83,38 +88,47 @@ class TorchStep(nn.Module):
         return z.T
 
 
-def random_dynamics(options: Options) -> MeanDynamics:
-    """Return mean dynamics with the weights of a trained flow's size."""
+class TorchFlowStep(nn.Module):
+    """The step by the flow that is trained, in any emission."""
+
+    def __init__(self, dynamics: MeanDynamics, flow: Flow) -> None:
+        super().__init__()
+        self.flow = flow
+        self.drift = torch.as_tensor(dynamics.latent.drift)
+        self.attractor = torch.as_tensor(dynamics.attractor)[:, None]
+
+    def forward(self, x: Tensor, dt: Tensor) -> Tensor:
+        """Return the states (n, d) a time dt after x (n, d)."""
+        y, _ = self.flow.inverse(x.T[None])
+        z = torch.linalg.matrix_exp(self.drift * dt) @ (y[0] - self.attractor) + self.attractor
+        return self.flow(z[None])[0].T
+
+
+def random_dynamics(options: Options) -> tuple[MeanDynamics, Flow]:
+    """Return mean dynamics with the weights of a trained flow's size, and their flow in torch."""
     generator = torch.Generator().manual_seed(0)
     d = options.n_dims
-    flow = CouplingFlow(
-        d, options.n_layers, options.n_hidden, log_scale_bound=options.log_scale_bound,
-        sharpness=2.0, generators=[generator],
-    ).double()  # fmt: skip
+    config = ImitationFlowConfig(
+        emission=options.emission, n_layers=options.n_layers, n_hidden=options.n_hidden,
+        log_scale_bound=options.log_scale_bound, sharpness=2.0,
+    )  # fmt: skip
+    flow = make_flow(config, d, 0, [generator]).double()
     with torch.no_grad():
         draw = torch.randn(flow.out_weight.shape, generator=generator, dtype=torch.float64)
         flow.out_weight += 0.1 * draw
-        field = CouplingField(
-            {
-                "rotation": flow.orthogonal()[:, 0].numpy(),
-                "hidden_weight": flow.hidden_weight[:, 0].numpy(),
-                "hidden_bias": flow.hidden_bias[:, 0, :, 0].numpy(),
-                "out_weight": flow.out_weight[:, 0].numpy(),
-                "out_bias": flow.out_bias[:, 0, :, 0].numpy(),
-            },
-            options,
-        )
+        field = make_field(config, flow.arrays(0))
     drift = (
         np.diag(-np.linspace(1, 3, d)) + np.triu(np.ones((d, d)), 1) - np.tril(np.ones((d, d)), -1)
     )
     attractor = field.inverse(np.zeros((1, d)))[0][0]
-    return MeanDynamics(
-        field, LinearField(drift, np.eye(d)), attractor, np.zeros(d), np.eye(d), 1.0
-    )
+    latent = LinearField(drift, np.eye(d))
+    return MeanDynamics(field, latent, attractor, np.zeros(d), np.eye(d), 1.0), flow
 
 
-def torch_ways(dynamics: MeanDynamics, options: Options) -> dict[str, Callable]:
+def torch_ways(dynamics: MeanDynamics, flow: Flow, options: Options) -> dict[str, Callable]:
     """Return eager, TorchScript and compiled torch, from arrays to arrays."""
+    if options.emission != "coupling":
+        return {"torch, eager": torch_way(TorchFlowStep(dynamics, flow).eval())}
     eager = TorchStep(dynamics).eval()
     example = (torch.zeros(3, options.n_dims, dtype=torch.float64), torch.tensor(0.01).double())
     with warnings.catch_warnings():
@@ -126,15 +140,17 @@ def torch_ways(dynamics: MeanDynamics, options: Options) -> dict[str, Callable]:
     modules = {"torch, eager": eager, "TorchScript, traced and frozen": script}
     if options.compile:
         modules["torch.compile"] = torch.compile(eager, dynamic=False)
+    return {name: torch_way(module) for name, module in modules.items()}
 
-    def way(module: Callable) -> Callable:
-        def step(x: np.ndarray, dt: float) -> np.ndarray:
-            with torch.inference_mode():
-                return module(torch.from_numpy(x), torch.tensor(dt, dtype=torch.float64)).numpy()
 
-        return step
+def torch_way(module: Callable) -> Callable:
+    """Return a module's step from arrays to arrays."""
 
-    return {name: way(module) for name, module in modules.items()}
+    def step(x: np.ndarray, dt: float) -> np.ndarray:
+        with torch.inference_mode():
+            return module(torch.from_numpy(x), torch.tensor(dt, dtype=torch.float64)).numpy()
+
+    return step
 
 
 def onnx_ways(dynamics: MeanDynamics) -> dict[str, Callable]:
@@ -160,7 +176,7 @@ def main() -> None:
     """Print a table."""
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(1)
-    dynamics = random_dynamics(options)
+    dynamics, flow = random_dynamics(options)
     stepper = RealTimeStepper(dynamics)
 
     def batched(x: np.ndarray, dt: float) -> np.ndarray:
@@ -172,7 +188,7 @@ def main() -> None:
         "NumPy, single state": lambda x, dt: stepper.step(x[0], dt)[None],
         "NumPy, batch": batched,
         **onnx_ways(dynamics),
-        **torch_ways(dynamics, options),
+        **torch_ways(dynamics, flow, options),
     }
     for n in (1, 1000):
         x = np.random.default_rng(0).normal(size=(n, options.n_dims))
@@ -189,7 +205,8 @@ def main() -> None:
         medians = {name: statistics.median(values) for name, values in times.items()}
         best = min(medians.values())
         print(
-            f"\n{n} state(s), {options.n_layers} layers of {options.n_hidden}, d = {options.n_dims}"
+            f"\n{n} state(s), {options.n_layers} {options.emission} layers of {options.n_hidden}, "
+            f"d = {options.n_dims}"
         )
         print(f"{'':32} {'median us':>9} {'least us':>9} {'ratio':>6} {'difference':>10}")
         for name, median in sorted(medians.items(), key=lambda item: item[1]):

@@ -34,6 +34,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.partial_fits import PartialFitError
 from iflow_gym.envs.point_mass import PointMassEnv
 from iflow_gym.system import DynamicalSystem, Guarantee
 
@@ -119,6 +120,22 @@ class Together(Toy):
         with (HERE / "batches").open("a") as file:
             print(len(seeds), file=file)
         return super()._fit_many(demonstrations, seeds)
+
+
+class Partly(Toy):
+    name = "partly"
+
+    def _fit_many(self, demonstrations, seeds):
+        systems, failures = [], {}
+        for i, (motion, seed) in enumerate(zip(demonstrations, seeds, strict=True)):
+            try:
+                systems.append(type(self)(self.config).fit(motion, seed=seed))
+            except ValueError as error:
+                systems.append(None)
+                failures[i] = error
+        if failures:
+            raise PartialFitError([d.name for d in demonstrations], systems, failures)
+        return systems
 
 
 class Other(Toy):
@@ -247,6 +264,20 @@ def test_a_batch_is_fitted_together_and_a_failing_one_cell_by_cell(toys, tmp_pat
 def found_path(results, environment):
     (path,) = [r.path for r in results if r.environment.endswith(environment)]
     return path
+
+
+def test_what_was_fitted_beside_a_failing_one_is_kept(toys, tmp_path):
+    output = tmp_path / "results"
+    (toys / "raise-Toy-C").touch()
+    status, text = run(output, "toys:Partly")
+    assert status == 1
+    assert "1 cell could not be fitted together (no fit of Toy-C); now one by one" in text
+    found = by_environment(output, "partly")
+    assert {name: r.ok for name, r in found.items()} == {s: s != "Toy-C-v0" for s in MOTIONS}
+    for r in (found["Toy-A-v0"], found["Toy-B-v0"]):
+        assert r.fit["batch_size"] == 3
+        assert r.metrics["fit_seconds"] == pytest.approx(r.fit["batch_wall_seconds"] / 3)
+    assert found["Toy-C-v0"].reason.startswith("ValueError: no fit of Toy-C")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="blocks a signal")

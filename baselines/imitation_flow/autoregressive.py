@@ -88,7 +88,7 @@ class AutoregressiveFlow(Flow):
         # Rows are s^_1, t_1, s^_2, t_2, ..: what a coordinate needs is together.
         out_weight = 0.01 * self.drawn(n_layers, 2 * n_dims, n_hidden, normal=True)
         self.out_weight = nn.Parameter(out_weight * self.out_mask)
-        self.out_bias = nn.Parameter(torch.zeros(n_layers, self.n_models, 2 * n_dims, 1))
+        self.out_bias = nn.Parameter(self.angles.new_zeros(n_layers, self.n_models, 2 * n_dims, 1))
 
     def weights(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return R, hidden weights (layers, m, 1 + h, 1 + k + d - 1), output weights (.., 1 + h).

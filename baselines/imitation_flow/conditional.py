@@ -29,9 +29,10 @@ from numpy.typing import ArrayLike, NDArray
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Frame, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
+from iflow_gym.baselines.imitation_flow.guard import Restart, restarts_of
 from iflow_gym.baselines.imitation_flow.latent import LinearLatent
 from iflow_gym.baselines.imitation_flow.model import ImitationFlow
-from iflow_gym.baselines.imitation_flow.training import Trained, train
+from iflow_gym.baselines.imitation_flow.training import Trained, train_one
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.model_files import (
     ModelFileError,
@@ -129,7 +130,7 @@ class ConditionalImitationFlow:
         arrays["log_time"] = np.linalg.lstsq(inputs, durations, rcond=None)[0]
         times = np.exp(inputs @ arrays["log_time"]).tolist()
         task = Task(list(motions), inputs[:, 1:], times)
-        (trained,) = train(self.config, [task], [np.random.default_rng(seed)])
+        trained = train_one(self.config, task, np.random.default_rng(seed))
         arrays["frame"] = Frame.of(task).matrix
         self._take(trained, arrays)
         return self
@@ -190,8 +191,12 @@ class ConditionalImitationFlow:
         """Write a safetensors file whose header holds the settings as JSON; replace atomically."""
         if not hasattr(self, "_arrays"):
             raise NotFittedError("ConditionalImitationFlow has not been fitted: call fit first.")
-        header = {"method": self.name, "config": dataclasses.asdict(self.config)}
-        header["n_dims"] = self._arrays["goals"].shape[1]
+        header = {
+            "method": self.name,
+            "config": dataclasses.asdict(self.config),
+            "n_dims": self._arrays["goals"].shape[1],
+            "restarts": self._trained.restarts,
+        }
         weights = {
             f"{part}.{name}": tensor.numpy()
             for part in ("flow", "latent")
@@ -212,10 +217,12 @@ class ConditionalImitationFlow:
             n_dims = header["n_dims"]
             if type(n_dims) is not int:
                 raise ValueError(f"expected n_dims to be a whole number, got {n_dims!r}")
-            model._restore(n_dims, arrays)
+            model._restore(n_dims, arrays, restarts_of(header))
         return model
 
-    def _restore(self, n_dims: int, arrays: dict[str, NDArray[Any]]) -> None:
+    def _restore(
+        self, n_dims: int, arrays: dict[str, NDArray[Any]], restarts: list[Restart]
+    ) -> None:
         weights = {k: arrays.pop(k) for k in list(arrays) if k.startswith(("flow.", "latent."))}
         n, k = arrays["contexts"].shape
         expected = {
@@ -247,7 +254,7 @@ class ConditionalImitationFlow:
                 if name.startswith(f"{part}.")
             }
             module.load_state_dict(named)
-        self._take(Trained(flow, latent, 0, []), arrays)
+        self._take(Trained(flow, latent, 0, restarts), arrays)
         self.at(arrays["contexts"][0])  # checks all that Lemma 1 needs
 
     def _take(self, trained: Trained, arrays: dict[str, NDArray[Any]]) -> None:

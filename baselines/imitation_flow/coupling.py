@@ -74,7 +74,7 @@ class CouplingFlow(Flow):
         self.out_weight = nn.Parameter(
             0.01 * self.drawn(n_layers, 2 * n_moved, n_hidden, normal=True)
         )
-        self.out_bias = nn.Parameter(torch.zeros(n_layers, self.n_models, 2 * n_moved, 1))
+        self.out_bias = nn.Parameter(self.angles.new_zeros(n_layers, self.n_models, 2 * n_moved, 1))
 
     def weights(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return R, hidden weights and output weights as `kernels` takes them."""

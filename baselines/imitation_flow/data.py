@@ -114,13 +114,12 @@ class Task:
     def periods(self) -> list[float]:
         """Seconds of a round of each recording: its own, or the given where it has too few."""
         inverse = np.linalg.inv(self.principal_axes).T
-        steps = [(h, m.period) for m in self.motions for h in m.dt]
+        steps = [(h, m.period) for m in self.motions for h in m.dt if m.period is not None]
         found = frequency.periods(
-            [path @ inverse for path in self.centred],
-            [float(given or 0.0) / h for h, given in steps],
+            [path @ inverse for path in self.centred], [given / h for h, given in steps]
         )
         return [
-            h * samples if samples is not None else float(given or 0.0)
+            h * samples if samples is not None else given
             for samples, (h, given) in zip(found, steps, strict=True)
         ]
 

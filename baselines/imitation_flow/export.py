@@ -17,9 +17,9 @@ ms for 1000; traced and frozen TorchScript takes 0.66 and 9 ms. The files have 3
 Runtime is 80 MB installed and torch 750, and torch deprecates TorchScript. Where this package is
 installed, `realtime` and the batch are faster than either.
 
-Inside, states are columns, as in `fields.coupling`. exp(A t) is closed in the plane, and else a
-Taylor series with scaling and squaring for each dt, which needs no eigenvectors of A: A may be
-defective.
+Inside, states are columns, as in `fields`; the flows' layers are in `graphs`. exp(A t) is closed in
+the plane, and else a Taylor series with scaling and squaring for each dt, which needs no
+eigenvectors of A: A may be defective.
 """
 
 from __future__ import annotations
@@ -31,13 +31,24 @@ from typing import Any
 
 import numpy as np
 
+from iflow_gym.baselines.imitation_flow.fields.autoregressive import AutoregressiveField
+from iflow_gym.baselines.imitation_flow.fields.base import FlowField
 from iflow_gym.baselines.imitation_flow.fields.coupling import CouplingField
+from iflow_gym.baselines.imitation_flow.fields.spline import SplineField
+from iflow_gym.baselines.imitation_flow.graphs import autoregressive, coupling, spline
 from iflow_gym.baselines.imitation_flow.onnx_graph import Graph
 from iflow_gym.baselines.imitation_flow.realtime import MeanDynamics
 from iflow_gym.demonstrations import FloatArray
 
 FORMAT_VERSION = 1
 """Version of the exported file: its inputs, outputs and metadata."""
+
+LAYERS: dict[type[FlowField], Any] = {
+    CouplingField: coupling,
+    AutoregressiveField: autoregressive,
+    SplineField: spline,
+}
+"""The module of each flow's graph, with `inverse` and `forward`."""
 
 TAYLOR_ORDER = 13
 """With a norm of at most 1/2 the rest of the series is below 1e-15."""
@@ -55,7 +66,7 @@ def export(
     Parameters
     ----------
     dynamics : MeanDynamics
-        With coupling layers, and a linear latent system or a limit cycle.
+        With a linear latent system or a limit cycle.
     path : path
         Of the file.
     velocity : bool
@@ -72,27 +83,28 @@ def export(
         For a flow or a latent system that has no graph here.
     """
     flow, d = dynamics.flow, dynamics.flow.n_dims
-    if not isinstance(flow, CouplingField):
+    if type(flow) not in LAYERS:
         raise TypeError(
-            f"Expected a flow of coupling layers to export, got {type(flow).__name__}: train with "
-            'emission="coupling".'
+            "Expected a flow of coupling, autoregressive or spline layers to export, got "
+            f"{type(flow).__name__}."
         )
+    layers = LAYERS[type(flow)]
     graph = Graph()
     inverse_frame = np.linalg.inv(dynamics.frame)
     attractor, origin = dynamics.attractor.reshape(d, 1), dynamics.origin.reshape(d, 1)
     shifted = graph("Sub", graph("Transpose", "x", perm=[1, 0]), origin)
-    encoded = _inverse(graph, flow, graph("MatMul", inverse_frame, shifted))
+    encoded = layers.inverse(graph, flow, graph("MatMul", inverse_frame, shifted))
     z = graph("Sub", encoded, attractor)
 
     time = graph("Div", "dt", np.array(dynamics.time))
     advanced = graph("Add", _propagate(graph, dynamics.latent, z, time, d), attractor)
-    y, _ = _forward(graph, flow, advanced, None)
+    y, _ = layers.forward(graph, flow, advanced, None)
     x_next = graph("Add", graph("MatMul", dynamics.frame, y), origin)
     graph("Transpose", x_next, perm=[1, 0], output="x_next")
 
     outputs = ["x_next"]
     if velocity:
-        _, rate = _forward(graph, flow, encoded, _rate(graph, dynamics.latent, z, d))
+        _, rate = layers.forward(graph, flow, encoded, _rate(graph, dynamics.latent, z, d))
         rate = graph("MatMul", dynamics.frame / dynamics.time, rate)
         outputs.append(graph("Transpose", rate, perm=[1, 0], output="velocity"))
 
@@ -107,55 +119,6 @@ def export(
     partial.write_bytes(content)
     partial.replace(target)
     return target
-
-
-# The flow -------------------------------------------------------------------------------------
-
-
-def _weights(flow: CouplingField) -> list[tuple[FloatArray, ...]]:
-    """Return R, W, w (h, 1), V, v (2 moved, 1) of every layer, for outputs s^ / b and t."""
-    rotation, hidden, hidden_bias, out, out_bias = flow.arrays.values()
-    scale = np.ones((out.shape[1], 1))
-    scale[: flow.n_dims - flow.n_kept] = flow.bound
-    biases = hidden_bias[..., None], out_bias[..., None] / scale
-    return list(zip(rotation, hidden, biases[0], out / scale, biases[1], strict=True))
-
-
-def _inverse(graph: Graph, flow: CouplingField, y: str) -> str:
-    d, k = flow.n_dims, flow.n_kept
-    a, b = graph.split(y, [k, d - k])
-    for rotation, hidden, hidden_bias, out, out_bias in reversed(_weights(flow)):
-        units = graph("Tanh", graph("Gemm", hidden, a, hidden_bias))
-        log_scale, shift = graph.split(graph("Gemm", out, units, out_bias), [d - k, d - k])
-        shrink = graph("Exp", graph("Mul", graph("Tanh", log_scale), np.array(-flow.bound)))
-        moved = graph("Mul", graph("Sub", b, shift), shrink)
-        turned = graph("MatMul", rotation.T, graph("Concat", a, moved, axis=0))
-        a, b = graph.split(turned, [k, d - k])
-    return turned
-
-
-def _forward(graph: Graph, flow: CouplingField, z: str, dz: str | None) -> tuple[str, str]:
-    """Return h(z) and, with a tangent, J_h(z) dz (else an empty name)."""
-    d, k = flow.n_dims, flow.n_kept
-    one, bound = np.array(1.0), np.array(flow.bound)
-    for rotation, hidden, hidden_bias, out, out_bias in _weights(flow):
-        a, b = graph.split(graph("MatMul", rotation, z), [k, d - k])
-        units = graph("Tanh", graph("Gemm", hidden, a, hidden_bias))
-        log_scale, shift = graph.split(graph("Gemm", out, units, out_bias), [d - k, d - k])
-        squashed = graph("Tanh", log_scale)
-        scale = graph("Exp", graph("Mul", squashed, bound))
-        z = graph("Concat", a, graph("Add", graph("Mul", b, scale), shift), axis=0)
-        if dz is None:
-            continue
-        da, db = graph.split(graph("MatMul", rotation, dz), [k, d - k])
-        slopes = graph("Sub", one, graph("Mul", units, units))
-        d_units = graph("Mul", slopes, graph("MatMul", hidden, da))
-        d_log_scale, d_shift = graph.split(graph("MatMul", out, d_units), [d - k, d - k])
-        slope = graph("Mul", graph("Sub", one, graph("Mul", squashed, squashed)), bound)
-        growth = graph("Mul", graph("Mul", slope, d_log_scale), b)
-        moved = graph("Add", graph("Mul", graph("Add", db, growth), scale), d_shift)
-        dz = graph("Concat", da, moved, axis=0)
-    return z, dz or ""
 
 
 # The latent system ----------------------------------------------------------------------------

@@ -46,7 +46,8 @@ class Flow(nn.Module, ABC):
     def drawn(self, *shape: int, normal: bool = False) -> Tensor:
         """Return uniform or normal numbers of shape (shape[0], m, *shape[1:])."""
         draw = torch.randn if normal else torch.rand
-        return torch.stack([draw(*shape, generator=g) for g in self._generators], dim=1)
+        single = torch.float32  # whatever the process's default is
+        return torch.stack([draw(*shape, generator=g, dtype=single) for g in self._generators], 1)
 
     def orthogonal(self) -> Tensor:
         """Return R of every layer, shape (layers, m, d, d)."""

@@ -4,7 +4,8 @@ Models that train together share nothing, so each is judged, taken back and slow
 `WINDOW` steps a model's mean and last loss are compared with the best window of its stage, which at
 first is what the stage began with. Where they are good
 the model's parameters and Adam's moments are kept; where it is far above the best, or not finite,
-they are put back, and the model's rate is halved from then on.
+they are put back, and the model's rate is halved from then on. A model for which that does not help
+has failed: it stays as it was last good, and the others train on.
 
 All parameters of all models lie in one array (m, p), a row a model, of which the modules' own are
 views: what is done to each is then done in one operation.
@@ -12,8 +13,8 @@ views: what is done to each is then done in one operation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -46,6 +47,20 @@ class Restart(NamedTuple):
     """Fraction of the learning rate from then on."""
 
 
+def restarts_of(header: Mapping[str, Any]) -> list[Restart]:
+    """Return the restarts that a model file's header holds; none where it does not speak of them.
+
+    Raises ValueError for anything that training does not record.
+    """
+    found = [Restart(*entry) for entry in header.get("restarts", [])]
+    for restart in found:
+        if type(restart.step) is not int or restart.step < 0:
+            raise ValueError(f"expected the step of a restart >= 0, got {restart.step!r}")
+        if type(restart.rate) is not float or not 0 < restart.rate < 1:
+            raise ValueError(f"expected the rate of a restart in (0, 1), got {restart.rate!r}")
+    return found
+
+
 class GuardedAdam:
     """Adam with a one-cycle rate for m models at once, and an eye on each.
 
@@ -64,6 +79,8 @@ class GuardedAdam:
     Attributes
     ----------
     restarts : list of m lists of Restart
+    failures : dict of int to TrainingError
+        Models that do not train on, and why.
     """
 
     def __init__(
@@ -92,12 +109,11 @@ class GuardedAdam:
         self._count, self._stage, self._slowed = 0, 0, False
         self._good = [t.clone() for t in self._state()]
         self.restarts: list[list[Restart]] = [[] for _ in self._names]
+        self.failures: dict[int, TrainingError] = {}
+        self._failed = torch.zeros_like(like, dtype=torch.bool)
 
     def step(self, step: int, stage: int, loss: Tensor) -> None:
-        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind.
-
-        Raises `TrainingError` where a model has diverged too often.
-        """
+        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind."""
         if stage != self._stage:
             self.look(step)
             self._stage = stage
@@ -111,7 +127,7 @@ class GuardedAdam:
              for g, p in zip(gradients, self._parameters, strict=True)]
         )  # fmt: skip
         norm = gradient.norm(dim=1)
-        finite = norm.isfinite()
+        finite = norm.isfinite() & ~self._failed if self.failures else norm.isfinite()
         gradient.masked_fill_(~finite[:, None], 0.0)
         gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm)).nan_to_num_(0.0)[:, None])
         self._last = torch.where(finite, loss.detach(), torch.inf)
@@ -126,14 +142,14 @@ class GuardedAdam:
             self.look(step)
 
     def finish(self, step: int) -> None:
-        """Look once more; raise `TrainingError` where a stage ends worse than it began."""
+        """Look once more; a stage that ends worse than it began is a failure."""
         self.look(step)
         worse = self._kept > self._first + self._first.abs().clamp_min(1.0)
-        for i in worse.nonzero()[:, 0].tolist():
-            raise TrainingError(
-                f"ImitationFlow did not converge on {self._names[i]!r}: its loss ended at "
-                f"{self._kept[i]:.3g} and was {self._first[i]:.3g} at the beginning. Lower "
-                "learning_rate or the weights."
+        for i in (worse & ~self._failed).nonzero()[:, 0].tolist():
+            self._fail(
+                i,
+                f"its loss ended at {self._kept[i]:.3g} and was {self._first[i]:.3g} at the "
+                "beginning",
             )
 
     def look(self, step: int) -> None:
@@ -144,6 +160,7 @@ class GuardedAdam:
         allowed = self._best + TOLERANCE * self._best.abs().clamp_min(1.0)
         bad = ~loss.isfinite() | (loss > allowed) | (self._last > allowed)
         bad |= ~self._flat.detach().isfinite().all(1)
+        bad &= ~self._failed
         self._best = torch.where(bad, self._best, torch.minimum(self._best, loss))
         self._kept = torch.where(bad, self._kept, loss)
         self._sum.zero_()
@@ -158,13 +175,21 @@ class GuardedAdam:
         for i in bad.nonzero()[:, 0].tolist():
             self.restarts[i].append(Restart(step, float(self._rate[i])))
             if len(self.restarts[i]) > MOST_RESTARTS:
-                raise TrainingError(
-                    f"ImitationFlow did not converge on {self._names[i]!r}: its training diverged "
-                    f"{len(self.restarts[i])} times, last at step {step} with "
-                    f"{self._rate[i]:.2g} of the learning rate. Lower learning_rate or the weights."
+                self._fail(
+                    i,
+                    f"its training diverged {len(self.restarts[i])} times, last at step {step} "
+                    f"with {self._rate[i]:.2g} of the learning rate",
                 )
         for now, kept in zip(self._state(), self._good, strict=True):
             now.copy_(torch.where(bad[:, None], kept, now))
+
+    def _fail(self, model: int, why: str) -> None:
+        """Leave a model as it is from now on."""
+        self._failed[model], self._rate[model] = True, 0.0
+        self.failures[model] = TrainingError(
+            f"ImitationFlow did not converge on {self._names[model]!r}: {why}. Lower learning_rate "
+            "or the weights."
+        )
 
     def _state(self) -> list[Tensor]:
         """Return the parameters and Adam's moments, zero before the first step."""

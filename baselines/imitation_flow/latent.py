@@ -86,9 +86,10 @@ class LinearLatent(Latent):
         super().__init__()
         self.min_decay = min_decay
         start = math.sqrt(INITIAL_DECAY - min(min_decay, 0.9 * INITIAL_DECAY))
-        self.factor = nn.Parameter(start * torch.eye(n_dims).repeat(n_models, 1, 1))
-        self.skew = nn.Parameter(torch.zeros(n_models, n_dims, n_dims))
-        self.log_noise = nn.Parameter(torch.full((n_models, n_dims), math.log(INITIAL_NOISE)))
+        eye = torch.eye(n_dims, dtype=torch.float32)  # whatever the process's default is
+        self.factor = nn.Parameter(start * eye.repeat(n_models, 1, 1))
+        self.skew = nn.Parameter(eye.new_zeros(n_models, n_dims, n_dims))
+        self.log_noise = nn.Parameter(eye.new_full((n_models, n_dims), math.log(INITIAL_NOISE)))
 
     def drift(self) -> Tensor:
         """Return A, shape (m, d, d)."""

@@ -60,10 +60,11 @@ class LimitCycleLatent(Latent):
         if n_dims < 2:
             raise ValueError(f"expected n_dims >= 2 for a cycle in the plane, got {n_dims}")
         self.min_decay = min_decay
-        self.log_decay = nn.Parameter(torch.zeros(n_models, n_dims - 1))
-        self.rate = nn.Parameter(torch.zeros(n_models))
-        self.log_radius = nn.Parameter(torch.zeros(n_models))
-        self.log_noise = nn.Parameter(torch.full((n_models, n_dims), math.log(INITIAL_NOISE)))
+        zeros = torch.zeros(n_models, dtype=torch.float32)  # whatever the process's default is
+        self.log_decay = nn.Parameter(zeros.new_zeros(n_models, n_dims - 1))
+        self.rate = nn.Parameter(zeros.clone())
+        self.log_radius = nn.Parameter(zeros.clone())
+        self.log_noise = nn.Parameter(zeros.new_full((n_models, n_dims), math.log(INITIAL_NOISE)))
         self.initialise(2 * math.pi, max(INITIAL_DECAY, 2 * min_decay), 1.0)
 
     def initialise(

@@ -30,7 +30,7 @@ from iflow_gym.baselines.imitation_flow.data import Frame, Task
 from iflow_gym.baselines.imitation_flow.emissions import FIELDS, make_field
 from iflow_gym.baselines.imitation_flow.export import export
 from iflow_gym.baselines.imitation_flow.fields.latents import CycleField, LatentField, LinearField
-from iflow_gym.baselines.imitation_flow.guard import Restart
+from iflow_gym.baselines.imitation_flow.guard import Restart, TrainingError, restarts_of
 from iflow_gym.baselines.imitation_flow.noise import (
     AdditiveNoise,
     LatentSDE,
@@ -38,8 +38,10 @@ from iflow_gym.baselines.imitation_flow.noise import (
 )
 from iflow_gym.baselines.imitation_flow.realtime import MeanDynamics, RealTimeStepper
 from iflow_gym.baselines.imitation_flow.stochastic import StochasticSystem
-from iflow_gym.baselines.imitation_flow.training import Trained, train
+from iflow_gym.baselines.imitation_flow.training import Trained, train, train_one
 from iflow_gym.demonstrations import Demonstrations, FloatArray
+from iflow_gym.model_files import model_file_errors, read_model_file, write_model_file
+from iflow_gym.partial_fits import PartialFitError
 from iflow_gym.system import DynamicalSystem, Guarantee, seconds, whole_number
 
 ORTHOGONAL = 1e-6
@@ -79,12 +81,14 @@ class ImitationFlow(DynamicalSystem):
     `fit_many` trains motions of like counts and dimensions in one batch, each from its own seed.
     What trains beside a motion changes the rounding of its sums and nothing else, but training
     amplifies rounding: after a full training a fit is as good and not bit for bit the one alone.
+    Where some diverge the others are trained to the end, and `fit_many` raises a `PartialFitError`
+    that holds them.
 
     Attributes
     ----------
     restarts_ : list of Restart
-        Where training diverged: the step, and the share of the learning rate it went on with. Empty
-        for a model from a file.
+        Where training diverged: the step, and the share of the learning rate it went on with. A
+        file keeps them.
 
     Examples
     --------
@@ -104,7 +108,7 @@ class ImitationFlow(DynamicalSystem):
 
     def _fit(self, demonstrations: Demonstrations, rng: np.random.Generator) -> None:
         task = Task([demonstrations])
-        self._take(train(self.config, [task], [rng])[0], task)
+        self._take(train_one(self.config, task, rng), task)
 
     def _fit_many(
         self, demonstrations: Sequence[Demonstrations], seeds: Sequence[int]
@@ -114,11 +118,24 @@ class ImitationFlow(DynamicalSystem):
         for i, task in enumerate(tasks):
             alike[task.shape].append(i)
         systems = [type(self)(self.config) for _ in seeds]
+        failures: dict[int, Exception] = {}
         for indices in alike.values():
             rngs = [np.random.default_rng(seeds[i]) for i in indices]
             trained = train(self.config, [tasks[i] for i in indices], rngs)
             for i, model in zip(indices, trained, strict=True):
-                systems[i]._take(model, tasks[i])
+                try:
+                    systems[i]._take(model, tasks[i])
+                except (TrainingError, ValueError) as error:
+                    failures[i] = error
+        if failures:
+            raise PartialFitError(
+                [motion.name for motion in demonstrations],
+                [
+                    None if i in failures else system._fitted(motion)
+                    for i, (system, motion) in enumerate(zip(systems, demonstrations, strict=True))
+                ],
+                failures,
+            )
         return systems
 
     def _check_demonstrations(self, demonstrations: Demonstrations) -> None:
@@ -134,8 +151,10 @@ class ImitationFlow(DynamicalSystem):
                 "'linear' or 'gmr', or add a coordinate."
             )
 
-    def _take(self, trained: Trained, task: Task) -> None:
-        """Take a trained model over into this system."""
+    def _take(self, trained: Trained | TrainingError, task: Task) -> None:
+        """Take a trained model over into this system; raise what became of one that is none."""
+        if isinstance(trained, TrainingError):
+            raise trained
         frame = Frame.of(task)
         arrays: dict[str, NDArray[Any]] = {
             **trained.arrays(),
@@ -310,7 +329,7 @@ class ImitationFlow(DynamicalSystem):
 
         Inputs ``x`` (n, d) and ``dt`` (n,) or (1,) in seconds, outputs ``x_next`` and ``velocity``
         (n, d), float64; without `velocity` a step takes half the time. See `export` for more.
-        Needs the extra ``onnx``, and coupling layers.
+        Needs the extra ``onnx``.
         """
         self._require_fit()
         reason = self.guarantee
@@ -322,6 +341,23 @@ class ImitationFlow(DynamicalSystem):
             guarantee=f"{reason.kind}: {reason.reason}",
             dt_unit="s",
         )
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write a model file, see `Method.save`; restarts of its training stand in the header."""
+        target = super().save(path)
+        if self.restarts_:
+            header, arrays = read_model_file(target)
+            write_model_file(target, {**header, "restarts": self.restarts_}, arrays)
+        return target
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file that `save` wrote; raise ModelFileError if it is anything else."""
+        system = super().load(path)
+        header, _ = read_model_file(path)
+        with model_file_errors(path, cls.name):
+            system.restarts_ = restarts_of(header)
+        return system
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return dict(self._parameters)

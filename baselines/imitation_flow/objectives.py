@@ -44,7 +44,7 @@ def random_pairs(
     if data.cyclic:  # times are in periods
         steps = (at / torch.gather(data.steps, 1, recordings)).long().clamp_min(1)
     else:
-        longest = (LONGEST_HORIZON * lengths).clamp_min(1.0)
+        longest = (LONGEST_HORIZON * lengths.float()).clamp_min(1.0)
         steps = torch.exp(at * torch.log(longest)).long()
     steps = torch.minimum(steps, lengths - 1)
     room = (lengths - steps)[..., None]

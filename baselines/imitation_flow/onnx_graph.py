@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 OPSET, IR_VERSION = 17, 8
 """Old enough for every ONNX Runtime since 1.12."""
 
+INT64 = 7
+"""ONNX's number of the type int64, for `Cast`."""
+
 Shape = tuple[int | str, ...]
 
 

@@ -108,7 +108,7 @@ def _goals(data: Recordings) -> Points:
     """Return the goal in each recording's context, or once where there is no context."""
     n = 1 if data.context is None else data.n_recordings
     everyone = torch.arange(n, device=data.device).expand(data.n_models, n)
-    return Points(torch.zeros(data.n_models, data.n_dims, n, device=data.device), everyone)
+    return Points(data.centre.new_zeros(data.n_models, data.n_dims, n), everyone)
 
 
 def _of(attractors: Tensor | None, data: Recordings, recordings: Tensor) -> Tensor | float:

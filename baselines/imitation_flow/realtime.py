@@ -3,9 +3,9 @@
     x -> h(phi_t(h^-1(x - x*))),    phi_t the latent system over a time t.
 
 For a single state the arithmetic is nothing and the calls are everything: a NumPy call costs some
-0.3 us, a Python float some 0.02. So a coupling layer is two products and a tanh on vectors that are
-allocated once, and everything about its few coordinates is done in floats. Other flows go through
-their batch of one. Equal to the batched path up to rounding.
+0.3 us, a Python float some 0.02. So a layer is two products and a tanh on vectors that are
+allocated once, and everything about its few coordinates is done in floats: see `fields.points`.
+Flows of other kinds go through their batch of one. Equal to the batched path up to rounding.
 """
 
 from __future__ import annotations
@@ -20,9 +20,13 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.linalg
 
+from iflow_gym.baselines.imitation_flow.fields.autoregressive import AutoregressiveField
+from iflow_gym.baselines.imitation_flow.fields.autoregressive_point import autoregressive_point
 from iflow_gym.baselines.imitation_flow.fields.base import FlowField
 from iflow_gym.baselines.imitation_flow.fields.coupling import CouplingField
 from iflow_gym.baselines.imitation_flow.fields.coupling_point import coupling_point
+from iflow_gym.baselines.imitation_flow.fields.spline import SplineField
+from iflow_gym.baselines.imitation_flow.fields.spline_point import SplinePoint
 from iflow_gym.demonstrations import FloatArray
 
 Vector = list[float]
@@ -42,6 +46,19 @@ class Latent(Protocol):
 
     def propagate(self, z: FloatArray, times: FloatArray) -> FloatArray:
         """Return the states a time (n,) after z, (n, d)."""
+
+
+class PointFlow(Protocol):
+    """A flow for one state (d,)."""
+
+    def forward(self, z: Vector) -> Vector:
+        """Return h(z)."""
+
+    def inverse(self, y: Vector) -> Vector:
+        """Return h^-1(y)."""
+
+    def push_forward(self, z: Vector, dz: Vector) -> tuple[Vector, Vector]:
+        """Return h(z) and J_h(z) dz."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +105,7 @@ class RealTimeStepper:
         self.dynamics = dynamics
         self._lock = threading.Lock()
         flow = dynamics.flow
-        self._flow = coupling_point(flow) if isinstance(flow, CouplingField) else BatchOfOne(flow)
+        self._flow = point_flow(flow)
         self._propagate, self._rate = point_latent(dynamics.latent)
         frame = np.asarray(dynamics.frame, dtype=np.float64)
         self._frame: list[Vector] = frame.tolist()
@@ -118,6 +135,17 @@ class RealTimeStepper:
     def _encode(self, x: FloatArray) -> Vector:
         y = _apply(self._back, [a - b for a, b in zip(x.tolist(), self._origin, strict=True)])
         return [a - b for a, b in zip(self._flow.inverse(y), self._attractor, strict=True)]
+
+
+def point_flow(flow: FlowField) -> PointFlow:
+    """Return a flow and its inverse for one state; not for several threads at once."""
+    if isinstance(flow, CouplingField):
+        return coupling_point(flow)
+    if isinstance(flow, AutoregressiveField):
+        return autoregressive_point(flow)
+    if isinstance(flow, SplineField):
+        return SplinePoint(flow)
+    return BatchOfOne(flow)
 
 
 class BatchOfOne:

@@ -80,7 +80,7 @@ class SplineFlow(Flow):
         self.hidden_bias = nn.Parameter(-(self.hidden_weight * places).detach().sum(-1, True))
         rows = n_moved * (3 * n_bins - 1)
         self.out_weight = nn.Parameter(0.01 * self.drawn(n_layers, rows, n_hidden, normal=True))
-        self.out_bias = nn.Parameter(torch.zeros(n_layers, self.n_models, rows, 1))
+        self.out_bias = nn.Parameter(self.angles.new_zeros(n_layers, self.n_models, rows, 1))
 
     def _row_bounds(self) -> Tensor:
         """Return `row_bounds` as a column, exact in any precision."""

@@ -94,11 +94,12 @@ class Trained:
 
 def train(
     config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
-) -> list[Trained]:
+) -> list[Trained | TrainingError]:
     """Train one model for each task and generator; return them in their order, on the CPU.
 
     The tasks have as many recordings, dimensions and context numbers each, and all end or all
-    repeat. Raises `TrainingError` where training diverges again and again.
+    repeat. A model whose training diverges again and again is returned as an error, to be raised
+    or collected: the others are trained to the end.
 
     On a CPU a batch takes one thread: its tensors are small, and threads that wait for each other
     within an operation made a fit ten times as slow on a busy machine. With more threads the models
@@ -109,7 +110,7 @@ def train(
 
     stop = threading.Event()
 
-    def batch(indices: range) -> list[Trained]:
+    def batch(indices: range) -> list[Trained | TrainingError]:
         torch.set_num_threads(1)  # a new thread begins with the process's number
         return _train(config, [tasks[i] for i in indices], [rngs[i] for i in indices], stop)
 
@@ -127,6 +128,14 @@ def train(
     return [model for _, model in sorted(zip(order, models, strict=True), key=lambda pair: pair[0])]
 
 
+def train_one(config: ImitationFlowConfig, task: Task, rng: np.random.Generator) -> Trained:
+    """Train one model; raise `TrainingError` where training diverges again and again."""
+    (trained,) = train(config, [task], [rng])
+    if isinstance(trained, TrainingError):
+        raise trained
+    return trained
+
+
 @contextmanager
 def _one_thread() -> Iterator[None]:
     n_threads = torch.get_num_threads()
@@ -142,7 +151,7 @@ def _train(
     tasks: Sequence[Task],
     rngs: Sequence[np.random.Generator],
     stop: threading.Event,
-) -> list[Trained]:
+) -> list[Trained | TrainingError]:
     device = torch.device(
         ("cuda" if torch.cuda.is_available() else "cpu")
         if config.device == "auto"
@@ -171,11 +180,16 @@ def _train(
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
         adam.step(step, _stage(config, step, data), loss)
+        if len(adam.failures) == len(tasks):
+            return [adam.failures[m] for m in range(len(tasks))]
     adam.finish(n_steps)
     if _stage(config, n_steps, data) == WHOLE:
         _fit_noise(flow, latent, data, rngs)
     flow, latent = flow.to("cpu"), latent.to("cpu")
-    return [Trained(flow, latent, m, adam.restarts[m]) for m in range(len(tasks))]
+    return [
+        adam.failures.get(m) or Trained(flow, latent, m, adam.restarts[m])
+        for m in range(len(tasks))
+    ]
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:

@@ -21,12 +21,14 @@ from iflow_gym.baselines.runner.plan import Cell, Job
 from iflow_gym.baselines.runner.scoring import (
     THREADS,
     Fit,
+    _measured,
     failed_result,
     fit_alone,
     fit_together,
     scored,
     scored_reference,
 )
+from iflow_gym.partial_fits import PartialFitError
 from iflow_gym.results import Result, read_result, write_result
 
 REPEAT_SECONDS = 10.0
@@ -97,19 +99,33 @@ def time_limit_of_batch(batch: Sequence[Cell]) -> float:
 
 
 def _fit_together(number: int, job: Job, journal: Journal) -> dict[Path, Fit]:
-    """Fit a batch; if that fails, there are no fits: the cells are then fitted one by one."""
+    """Fit a batch; cells that it has no fits of are then fitted one by one."""
     name, n, limit = job.batch[0].entry.name, len(job.batch), time_limit_of_batch(job.batch)
     label = f"{name}, {job.batch[0].protocol}"
     journal.write("batch", label=label, cells=n, number=number, limit=limit)
     try:
         with _time_limit(limit):
-            fits = fit_together(job.batch)
-        return {cell.path: fit for cell, fit in zip(job.batch, fits, strict=True)}
+            fits, why = _fits_of(job.batch)
+        found = {c.path: fit for c, fit in zip(job.batch, fits, strict=True) if fit is not None}
     except BaseException as error:
-        why = _reason(error, limit).splitlines()[0]
-        text = f"{name}: {n} cells could not be fitted together ({why}); now one by one"
+        found, why = {}, _reason(error, limit).splitlines()[0]
+    if why:
+        left = n - len(found)
+        cells = "1 cell" if left == 1 else f"{left} cells"
+        text = f"{name}: {cells} could not be fitted together ({why}); now one by one"
         journal.write("note", text=text)
-        return {}
+    return found
+
+
+def _fits_of(batch: Sequence[Cell]) -> tuple[Sequence[Fit | None], str]:
+    """Fit a batch; return None where a motion alone could not be learned, and why."""
+    with _measured() as cost:
+        try:
+            return fit_together(batch), ""
+        except PartialFitError as error:
+            systems = error.systems
+            why = "no fit of " + ", ".join(error.names[i] for i in sorted(error.failures))
+    return [None if s is None else Fit(s, cost, len(batch)) for s in systems], why
 
 
 def _attempt(cell: Cell, fitted: Fit | None, folder: Path) -> Result:

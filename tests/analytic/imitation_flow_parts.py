@@ -5,20 +5,25 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from iflow_gym.baselines.imitation_flow.autoregressive import AutoregressiveFlow
 from iflow_gym.baselines.imitation_flow.coupling import CouplingFlow
-from iflow_gym.baselines.imitation_flow.fields.coupling import CouplingField
+from iflow_gym.baselines.imitation_flow.emissions import FIELDS
 from iflow_gym.baselines.imitation_flow.fields.latents import CycleField, LinearField
 from iflow_gym.baselines.imitation_flow.realtime import MeanDynamics
+from iflow_gym.baselines.imitation_flow.spline import SplineFlow
 
 BOUND = 0.3
+SPLINE = {"n_bins": 8, "bound": 2.0}
+EMISSIONS = ("coupling", "autoregressive", "spline")
 
 
-def random_flow(d, n_layers=8, n_hidden=12, seed=0, n_context=0):
+def random_flow(d, n_layers=8, n_hidden=12, seed=0, n_context=0, emission="coupling"):
     """Return the torch flow of one model in float64."""
     generator = torch.Generator().manual_seed(seed)
-    flow = CouplingFlow(
+    kind = {"coupling": CouplingFlow, "autoregressive": AutoregressiveFlow, "spline": SplineFlow}
+    flow = kind[emission](
         d, n_layers, n_hidden, n_context, log_scale_bound=BOUND, sharpness=2.0,
-        generators=[generator],
+        generators=[generator], **(SPLINE if emission == "spline" else {}),
     ).double()  # fmt: skip
     with torch.no_grad():
         for parameter in (flow.out_weight, flow.out_bias):
@@ -39,8 +44,9 @@ def flow_arrays(flow):
         return {name: value.numpy().copy() for name, value in arrays.items()}
 
 
-def as_field(arrays, bound=BOUND):
-    return CouplingField(arrays, SimpleNamespace(log_scale_bound=bound))
+def as_field(arrays, bound=BOUND, emission="coupling"):
+    config = SimpleNamespace(log_scale_bound=bound, spline_bound=SPLINE["bound"])
+    return FIELDS[emission](arrays, config)
 
 
 def linear_latent(d, seed=0, drift=None):
@@ -54,9 +60,11 @@ def cycle_latent(d):
     return CycleField(np.linspace(2, 3, d - 1), np.array([-5.0]), np.array([1.2]), np.full(d, 0.1))
 
 
-def dynamics(d, latent=None, seed=0, n_layers=8):
+def dynamics(d, latent=None, seed=0, n_layers=8, emission="coupling"):
     rng = np.random.default_rng(seed)
-    field = as_field(flow_arrays(random_flow(d, n_layers=n_layers, seed=seed)))
+    flow = random_flow(d, n_layers=n_layers, seed=seed, emission=emission)
+    arrays = flow_arrays(flow) if emission == "coupling" else flow.arrays(0)
+    field = as_field(arrays, emission=emission)
     latent = linear_latent(d) if latent is None else latent
     cyclic = isinstance(latent, CycleField)
     attractor = np.zeros(d) if cyclic else field.inverse(np.zeros((1, d)))[0][0]

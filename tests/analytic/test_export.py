@@ -7,7 +7,15 @@ import sys
 
 import numpy as np
 import pytest
-from imitation_flow_parts import cycle_latent, dynamics, linear_latent, states, step, velocity
+from imitation_flow_parts import (
+    EMISSIONS,
+    cycle_latent,
+    dynamics,
+    linear_latent,
+    states,
+    step,
+    velocity,
+)
 
 from iflow_gym.baselines.imitation_flow.export import FORMAT_VERSION, export
 
@@ -65,8 +73,9 @@ def loaded(path):
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_the_runtime_alone_steps_as_the_system(d, tmp_path):
-    parts = dynamics(d)
+@pytest.mark.parametrize("emission", EMISSIONS)
+def test_the_runtime_alone_steps_as_the_system(d, emission, tmp_path):
+    parts = dynamics(d, emission=emission)
     x = states(parts)
     each = np.random.default_rng(0).uniform(0.001, 3, len(x))
     export(parts, tmp_path / "model.onnx")
@@ -106,8 +115,9 @@ def test_the_centre_of_a_cycle(tmp_path):
     assert np.isfinite(result).all()
 
 
-def test_far_away(tmp_path):
-    parts = dynamics(2, n_layers=24)
+@pytest.mark.parametrize("emission", EMISSIONS)
+def test_far_away(emission, tmp_path):
+    parts = dynamics(2, n_layers=24, emission=emission)
     x = states(parts, spread=3e4)
     session = loaded(export(parts, tmp_path / "model.onnx"))
     got, rate = session.run(None, {"x": x, "dt": np.array([0.1])})
@@ -128,6 +138,18 @@ def test_the_file_says_what_it_is(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["model.onnx"]
 
 
+@pytest.mark.parametrize("d", [2, 3, 6])
+@pytest.mark.parametrize("emission", EMISSIONS)
+def test_every_emission_over_a_cycle(d, emission, tmp_path):
+    parts = dynamics(d, cycle_latent(d), emission=emission)
+    x = states(parts, n=200)  # on both sides of where splines end
+    session = loaded(export(parts, tmp_path / "model.onnx"))
+    got, rate = session.run(None, {"x": x, "dt": np.array([0.3])})
+    np.testing.assert_allclose(got, step(parts, x, np.full(len(x), 0.3)), rtol=0, atol=1e-10)
+    expected = velocity(parts, x)
+    np.testing.assert_allclose(rate, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
 def test_a_file_without_the_velocity(tmp_path):
     parts = dynamics(2)
     session = loaded(export(parts, tmp_path / "model.onnx", velocity=False))
@@ -139,7 +161,10 @@ def test_a_file_without_the_velocity(tmp_path):
 
 def test_other_parts_are_refused(tmp_path):
     parts = dynamics(2)
-    for name, match in (("flow", "coupling layers"), ("latent", "linear latent system")):
+    for name, match in (
+        ("flow", "coupling, autoregressive or spline layers"),
+        ("latent", "linear latent system"),
+    ):
         other = type("Other", (), {"n_dims": 2})()
         fields = {**vars(parts), name: other}
         with pytest.raises(TypeError, match=f"Expected a .*{match}.*, got Other"):

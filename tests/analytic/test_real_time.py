@@ -10,6 +10,7 @@ import pytest
 import scipy.linalg
 import torch
 from imitation_flow_parts import (
+    EMISSIONS,
     cycle_latent,
     dynamics,
     flow_arrays,
@@ -20,8 +21,12 @@ from imitation_flow_parts import (
     velocity,
 )
 
-from iflow_gym.baselines.imitation_flow.fields.coupling_point import coupling_point
-from iflow_gym.baselines.imitation_flow.realtime import RealTimeStepper, linear
+from iflow_gym.baselines.imitation_flow.realtime import (
+    BatchOfOne,
+    RealTimeStepper,
+    linear,
+    point_flow,
+)
 
 TIMES = [1e-6, 0.01, 0.3, 5.0, 400.0]
 
@@ -63,8 +68,10 @@ def assert_is_the_batch(parts, x):
 
 @pytest.mark.parametrize("d", [2, 3, 6])
 @pytest.mark.parametrize("latent", [linear_latent, cycle_latent])
-def test_one_state_is_the_batch(d, latent):
-    parts = dynamics(d, latent(d))
+@pytest.mark.parametrize("emission", EMISSIONS)
+def test_one_state_is_the_batch(d, latent, emission):
+    parts = dynamics(d, latent(d), emission=emission)
+    assert not isinstance(point_flow(parts.flow), BatchOfOne)
     assert_is_the_batch(parts, states(parts))
 
 
@@ -76,12 +83,14 @@ def test_other_flows_and_latent_systems_go_through_their_batch(d):
 
 
 @pytest.mark.parametrize("d", [2, 3, 6])
-def test_the_flow_is_torchs(d):
-    flow = random_flow(d, n_layers=24)
-    parts = dynamics(d, n_layers=24)
-    for name, array in flow_arrays(flow).items():
-        np.testing.assert_array_equal(parts.flow.arrays[name], array)
-    point = coupling_point(parts.flow)
+@pytest.mark.parametrize("emission", EMISSIONS)
+def test_the_flow_is_torchs(d, emission):
+    flow = random_flow(d, n_layers=24, emission=emission)
+    parts = dynamics(d, n_layers=24, emission=emission)
+    if emission == "coupling":
+        for name, array in flow_arrays(flow).items():
+            np.testing.assert_array_equal(parts.flow.arrays[name], array)
+    point = point_flow(parts.flow)
     for z in np.random.default_rng(0).normal(size=(10, d)):
         with torch.no_grad():
             y = flow(torch.as_tensor(z)[None, :, None])
@@ -89,14 +98,32 @@ def test_the_flow_is_torchs(d):
         np.testing.assert_allclose(point.inverse(y[0, :, 0].tolist()), z, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("emission", EMISSIONS)
 @pytest.mark.parametrize("d", [2, 3])
-def test_far_away(d):
-    parts = dynamics(d, n_layers=24)
+def test_far_away(d, emission):
+    parts = dynamics(d, n_layers=24, emission=emission)
     x = states(parts, n=10, spread=3e4)
     stepper = RealTimeStepper(parts)
     got = np.stack([stepper.step(state, 0.1) for state in x])
     np.testing.assert_allclose(got, step(parts, x, np.full(10, 0.1)), rtol=1e-10)
     assert np.isfinite([stepper.velocity(state) for state in x]).all()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_where_splines_end(d):
+    """At +-B and beside it, where a spline becomes the identity, and with one bin for all."""
+    parts = dynamics(d, emission="spline", n_layers=1)
+    point, bound = point_flow(parts.flow), parts.flow.bound
+    rotation = parts.flow.arrays["rotation"][0]
+    for value in (-bound, -np.nextafter(bound, 0), np.nextafter(bound, 0), bound, 1.5 * bound):
+        u = np.full(d, 0.3)
+        u[-1] = value
+        z = (rotation.T @ u).tolist()
+        y, dy = point.push_forward(z, [1.0] * d)
+        expected = parts.flow.push_forward(np.array([z]), np.ones((1, d)))
+        np.testing.assert_allclose([y, dy], np.concatenate(expected), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(point.forward(z), y, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(point.inverse(y), z, rtol=0, atol=1e-13)
 
 
 def test_the_goal_stays():

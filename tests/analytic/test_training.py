@@ -1,13 +1,23 @@
 """Training that goes wrong is noticed, taken back, recorded, and never returned as a fit."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
 
-from iflow_gym.baselines.imitation_flow import ImitationFlow, guard, training
+from iflow_gym.baselines.imitation_flow import (
+    ConditionalImitationFlow,
+    ImitationFlow,
+    guard,
+    training,
+)
 from iflow_gym.baselines.imitation_flow.guard import TrainingError
 from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.datasets.letters import load_letter
 from iflow_gym.metrics import rmse
+from iflow_gym.model_files import ModelFileError, read_model_file, write_model_file
+from iflow_gym.partial_fits import PartialFitError
 
 SMALL = {"n_layers": 2, "n_times": 5, "n_pairs": 14}
 
@@ -78,13 +88,130 @@ def test_an_end_that_is_worse_than_the_beginning_is_an_error():
         ImitationFlow(n_steps=300, learning_rate=1e8, **SMALL).fit(load_lasa("Angle"), seed=0)
 
 
-def test_training_that_diverges_for_good_is_an_error(monkeypatch):
+def test_training_that_diverges_for_good_is_an_error_that_holds_the_others(monkeypatch):
+    """They are the same bits as without it, and come back from the error as they would without."""
+    undisturbed = fit(n_steps=400)
     disturbed(monkeypatch, [torch.nan, 1.0], lambda n: n % 5 == 0)
-    with pytest.raises(TrainingError, match=r"converge on 'LASA-Angle': its training diverged 6"):
+    with pytest.raises(
+        PartialFitError, match=r"1 of 2 motions .*'LASA-Angle' at place 0"
+    ) as caught:
         fit(n_steps=400)
+    error = pickle.loads(pickle.dumps(caught.value))
+    assert error.names == ["LASA-Angle", "LASA-Line"]
+    assert str(error) == str(caught.value)
+    (failure,) = error.failures.values()
+    assert list(error.failures) == [0]
+    assert isinstance(failure, TrainingError)
+    assert "did not converge on 'LASA-Angle': its training diverged 6" in str(failure)
+    assert error.systems[0] is None
+    x = [[-10.0, 5.0], [3.0, 4.0]]
+    np.testing.assert_array_equal(error.systems[1].velocity(x), undisturbed[1].velocity(x))
+    assert error.systems[1].guarantee.kind == "proved"
+
+
+def test_failures_in_batches_of_their_own_are_collected(monkeypatch):
+    """Two batches, since the counts differ; in each one model fails, in one of them at the end."""
+    motions = [load_lasa("Angle"), load_lasa("Line")]
+    motions += [motion.subset(range(3)) for motion in motions]
+    disturbed(monkeypatch, [torch.nan, 1.0], lambda n: n % 5 == 0)
+    take, calls = ImitationFlow._take, []
+
+    def refused(self, trained, task):
+        calls.append(1)
+        if len(calls) == 4:
+            raise ValueError("expected a flow that inverts")
+        take(self, trained, task)
+
+    monkeypatch.setattr(ImitationFlow, "_take", refused)
+    with pytest.raises(PartialFitError, match="3 of 4 motions") as caught:
+        ImitationFlow(n_steps=160, **SMALL).fit_many(motions, seeds=[0, 1, 2, 3])
+    assert {i: type(e) for i, e in caught.value.failures.items()} == {
+        0: TrainingError,
+        2: TrainingError,
+        3: ValueError,
+    }
+    assert [s is None for s in caught.value.systems] == [True, False, True, True]
+
+
+def test_a_batch_that_fails_whole_ends_at_once(monkeypatch):
+    """The second model fails first: each has its own error all the same."""
+    calls, late = [], 4 * guard.WINDOW
+    disturbed(monkeypatch, [torch.nan, 1.0], lambda n: n > late)
+    disturbed(monkeypatch, [1.0, torch.nan], lambda n: calls.append(n) or True)
+    with pytest.raises(PartialFitError, match="2 of 2 motions") as caught:
+        fit(n_steps=5000)
+    assert len(calls) == late + (guard.MOST_RESTARTS + 1) * guard.WINDOW
+    failures = caught.value.failures
+    assert "on 'LASA-Angle': its training diverged 6 times, last at step 249" in str(failures[0])
+    assert "on 'LASA-Line': its training diverged 6 times, last at step 149" in str(failures[1])
+
+
+def test_a_file_keeps_where_training_was_taken_back(monkeypatch, tmp_path):
+    disturbed(monkeypatch, [torch.nan, 1.0], lambda n: n in (30, 60))
+    systems = fit()
+    assert [r.rate for r in systems[0].restarts_] == [0.5, 0.25]
+    for system in systems:
+        again = ImitationFlow.load(system.save(tmp_path / "model"))
+        assert again.restarts_ == system.restarts_
+        assert all(isinstance(restart, guard.Restart) for restart in again.restarts_)
+
+
+def test_a_file_of_several_motions_keeps_it_too(monkeypatch, tmp_path):
+    disturbed(monkeypatch, [torch.nan], lambda n: n == 30)
+    motions = [load_lasa("Angle"), load_lasa("Line")]
+    model = ConditionalImitationFlow(n_steps=60, **SMALL).fit(motions, seed=0)
+    again = ConditionalImitationFlow.load(model.save(tmp_path / "model"))
+    assert len(model.at([1, 0]).restarts_) == 1
+    assert again.at([1, 0]).restarts_ == model.at([1, 0]).restarts_
+
+
+@pytest.mark.parametrize(
+    "restarts", [[[3]], [[-1, 0.5]], [[3, 1.5]], [["3", 0.5]], [[3, float("nan")]], 7]
+)
+def test_restarts_that_no_training_records_are_refused(restarts, tmp_path):
+    path = fit(n_steps=1)[0].save(tmp_path / "model")
+    header, arrays = read_model_file(path)
+    write_model_file(path, {**header, "restarts": restarts}, arrays)
+    with pytest.raises(ModelFileError, match="no whole 'imitation-flow' model"):
+        ImitationFlow.load(path)
 
 
 @pytest.mark.parametrize("setting", ["calm_weight", "tube_weight", "likelihood_weight"])
 def test_weights_must_be_finite(setting):
     with pytest.raises(ValueError, match=f"finite {setting} >= 0, got nan"):
         ImitationFlow(**{setting: float("nan")})
+
+
+@pytest.fixture
+def double_precision():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+CASES = [
+    (emission, name, {"objective": objective})
+    for emission in ("coupling", "autoregressive", "spline")
+    for name, objective in (("Angle", "reproduction"), ("Angle", "paper"), ("I", "reproduction"))
+]
+
+
+def short_fit(emission, name, settings):
+    motion = load_letter(name) if len(name) == 1 else load_lasa(name)
+    method = ImitationFlow(emission=emission, n_steps=20, **SMALL, **settings)
+    return method.fit(motion.subset(range(3)), seed=0)
+
+
+@pytest.fixture(scope="module")
+def in_single_precision():
+    return [short_fit(*case) for case in CASES]
+
+
+@pytest.mark.parametrize("case", range(len(CASES)), ids=["-".join(c[:2]) for c in CASES])
+def test_the_processs_default_precision_changes_nothing(
+    case, in_single_precision, double_precision
+):
+    system, expected = short_fit(*CASES[case]), in_single_precision[case]
+    for name, array in expected._parameters.items():
+        np.testing.assert_array_equal(system._parameters[name], array, err_msg=name)

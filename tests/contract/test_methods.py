@@ -483,6 +483,12 @@ def model(request, tmp_path):
     return fitted(request.getfixturevalue("name")).save(tmp_path / "model.safetensors")
 
 
+@every_cell
+def test_no_array_has_a_name_that_a_file_keeps_for_itself(name, shape):
+    """`save` would write the goal, or the period, in its place."""
+    assert not {"goal", "period"} & set(fitted(name, shape)._arrays())
+
+
 @every_method
 def test_a_truncated_file_is_refused(name, model):
     whole = model.read_bytes()

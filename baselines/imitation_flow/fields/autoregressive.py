@@ -95,6 +95,7 @@ class AutoregressiveField(FlowField):
             if not np.isfinite(value).all():
                 raise ValueError(f"expected finite {name}, got nan or inf")
         self.n_dims = d
+        self.arrays = dict(zip(self.NAMES, values, strict=True))
         degrees = unit_degrees(h, d)
         _, hidden_weight, _, out_weight, _ = values
         if hidden_weight[:, degrees[:, None] <= np.arange(d - 1)].any():
@@ -102,7 +103,7 @@ class AutoregressiveField(FlowField):
         if out_weight.transpose(0, 1, 3, 2)[:, np.arange(d)[:, None] < degrees].any():
             raise ValueError("expected out_weight 0 where an output may not see, got others")
         # Units of degree k are ends[k - 1] to ends[k]: contiguous, since degrees are sorted.
-        self._ends = np.searchsorted(degrees, np.arange(d), side="right").tolist()
+        self.ends: list[int] = np.searchsorted(degrees, np.arange(d), side="right").tolist()
         values[2], values[4] = values[2][..., None], values[4][..., None]
         self._layers = [_Layer(*layer) for layer in zip(*values, strict=True)]
 
@@ -112,7 +113,7 @@ class AutoregressiveField(FlowField):
         for layer in self._layers:
             u = layer.rotation @ y
             y, hidden = np.empty_like(u), np.empty((len(layer.hidden_bias), u.shape[1]))
-            for i, (start, end) in enumerate(zip([0, *self._ends], self._ends, strict=False)):
+            for i, (start, end) in enumerate(zip([0, *self.ends], self.ends, strict=False)):
                 if end > start:
                     hidden[start:end] = self._units(layer, slice(start, end), y[:i])
                 log_scale, shift = self._coefficients(layer, i, hidden[:end])
@@ -140,7 +141,7 @@ class AutoregressiveField(FlowField):
             y, dy = np.empty_like(u), np.empty_like(u)
             hidden = np.empty((len(layer.hidden_bias), u.shape[1]))
             d_hidden = np.empty_like(hidden)
-            for i, (start, end) in enumerate(zip([0, *self._ends], self._ends, strict=False)):
+            for i, (start, end) in enumerate(zip([0, *self.ends], self.ends, strict=False)):
                 if end > start:
                     units = slice(start, end)
                     hidden[units] = self._units(layer, units, y[:i])

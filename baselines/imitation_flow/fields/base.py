@@ -46,6 +46,8 @@ class FlowField(ABC):
     NAMES: ClassVar[tuple[str, ...]]
     """The names of the flow's arrays."""
     n_dims: int
+    arrays: dict[str, FloatArray]
+    """Those under `NAMES`, in float64."""
 
     @abstractmethod
     def __init__(self, arrays: Mapping[str, NDArray[Any]], config: FlowConfig) -> None: ...

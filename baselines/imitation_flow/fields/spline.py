@@ -118,7 +118,9 @@ class SplineField(FlowField):
             if not np.isfinite(value).all():
                 raise ValueError(f"expected finite {name}, got nan or inf")
         self.n_dims, self.n_kept, self.n_bins = d, kept, (rows + 1) // 3
-        self._row_bounds = row_bounds(self.n_bins, config.log_scale_bound)[:, None]
+        self.arrays = dict(zip(self.NAMES, values, strict=True))
+        self.row_bounds = row_bounds(self.n_bins, config.log_scale_bound)
+        self._row_bounds = self.row_bounds[:, None]
         values[2], values[4] = values[2][..., None], values[4].reshape(n_layers, -1, 1)
         values[3] = values[3].reshape(n_layers, -1, h)
         self._layers = [_Layer(*layer) for layer in zip(*values, strict=True)]

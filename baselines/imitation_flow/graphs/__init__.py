@@ -1,0 +1,1 @@
+"""Trained emissions as ONNX graphs."""
