@@ -50,15 +50,15 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     ## Description
     A seven-joint Franka arm stands before two drums with a stick in its hand, in MuJoCo. The
     motion is that of the ImitationFlow paper's robot experiment: an arch between the drums, high
-    over on the way to the right one, low on the way back, a sharp turn on either head, about 5 s a
+    over on the way to the right one, low on the way back, a stroke on either head, about 5 s a
     round. A policy sees where the stick's tip is and says how it should move; a controller turns
     that into torques of the joints, with the stick's orientation held. A good policy goes round on
     the demonstrated orbit, comes back to it after a push, and hits each drum when the
     demonstrations do.
 
     Physics run at 1 kHz, control at 100 Hz. Lengths are metres in the frame of the arm's base: x
-    forward, y to the left, z up. The head of a drum gives way softly, and stops the tip: what a
-    command asks beyond it becomes force.
+    forward, y to the left, z up. The heads are of mesh, as on electronic drums: they give way by
+    0.5 N/mm, with some damping, and a stroke follows through, about 1 cm into the head.
 
     `env.unwrapped` has `demonstrations`, `drums`, `dt`, `max_speed`, `n_dims`, the conversions
     `velocity_to_action`, `action_to_velocity` and `command_to_action`, `score_of` (the notes that

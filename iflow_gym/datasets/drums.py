@@ -40,7 +40,7 @@ DRUMS: Final = (RIGHT, LEFT)
 """The kit of `iflow/Drumming-v0`; a hit's `drum` is an index into it."""
 
 FILE: Final = "drums.npz"
-SHA256: Final = "2004da04fc2ada7052a3526d995377d3be39f7c89634410b32875c876aa4f9c6"
+SHA256: Final = "889df8d5e5e5438e031cd9092f99448495f5c52abe199593e3626bdd5280160d"
 
 
 @lru_cache(maxsize=1)
