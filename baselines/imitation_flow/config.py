@@ -72,6 +72,11 @@ class ImitationFlowConfig:
     """Weight of the penalty on speed away from the demonstrations. 0 leaves it out."""
     calm_speed: float = 1.5
     """Speeds up to this multiple of the demonstrations' peak cost nothing."""
+    orbit_weight: float | None = None
+    """Weight of the orbit's likelihood for motions that repeat (`mean_orbit`). None takes 0 in the
+    plane and 1 in more dimensions, where what a cycle touches matters."""
+    orbit_resolution: float = 0.01
+    """Standard deviation to which the orbit is held where all recordings agree."""
     min_decay: float = 0.05
     """Slowest decay of the latent system, per duration: eps in A = -(L L^T + eps I) + S - S^T."""
     noise: Noise = "additive"
@@ -105,7 +110,7 @@ class ImitationFlowConfig:
             raise ValueError(f"Expected the name of a device, got {self.device!r}.")
         for name in (
             "log_scale_bound", "sharpness", "learning_rate", "max_gradient_norm", "min_decay",
-            "calm_speed", "tube_width", "spline_bound",
+            "calm_speed", "tube_width", "spline_bound", "orbit_resolution",
         ):  # fmt: skip
             value = getattr(self, name)
             if not (name == "sharpness" and value is None) and not 0 < value < math.inf:
@@ -119,9 +124,12 @@ class ImitationFlowConfig:
             raise ValueError(
                 f"Expected likelihood_fraction in [0, 1], got {self.likelihood_fraction}."
             )
-        for name in ("likelihood_weight", "tube_weight", "calm_weight", "end_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"Expected a finite {name} >= 0, got {getattr(self, name)}.")
+        for name in (
+            "likelihood_weight", "tube_weight", "calm_weight", "end_weight", "orbit_weight",
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (name == "orbit_weight" and value is None) and not 0 <= value < math.inf:
+                raise ValueError(f"Expected a finite {name} >= 0, got {value}.")
 
     def steps(self, *, cyclic: bool) -> int:
         """Return the steps of Adam for motions that repeat or end."""
@@ -134,3 +142,11 @@ class ImitationFlowConfig:
         if self.sharpness is not None:
             return self.sharpness
         return CYCLE_SHARPNESS if cyclic else SHARPNESS
+
+    def weight_of_orbit(self, *, cyclic: bool, n_dims: int) -> float:
+        """Return the weight of the orbit's likelihood, 0 where motions end."""
+        if not cyclic:
+            return 0.0
+        if self.orbit_weight is not None:
+            return self.orbit_weight
+        return 1.0 if n_dims > 2 else 0.0
