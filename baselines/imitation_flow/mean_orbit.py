@@ -5,11 +5,12 @@ flow rounds a sharp turn off. Where all recordings do the same, as a drummer doe
 drum, that is wrong by many times their spread. Here the orbit of the model is a curve with a normal
 density around it,
 
-    h(rho* (cos, sin)(2 pi u + psi0)) ~ N(c(u), S(u) + tau^2 c'(u) c'(u)^T + eps^2 I),
+    h(rho* (cos, sin)(b u + psi0)) ~ N(c(u), S(u) + tau^2 c'(u) c'(u)^T + eps^2 I),
 
 c(u) the mean of the recordings at phase u, S(u) their spread about it, tau the standard error of its phase (theirs spread over the
 root of the number of rounds), and eps the resolution. So the
-orbit is held tightly where the recordings agree and loosely where they differ. The phase psi0 is
+orbit is held tightly where the recordings agree and loosely where they differ, and a round of the model, at
+the latent rate b over the times u in (-1/2, 1/2), takes their mean period. The phase psi0 is
 the circular mean of what the model takes c(u) for.
 
 Tempo varies within a round, which would blur turns in a mean over time. So pieces of the recordings
@@ -19,7 +20,6 @@ the recordings' mean time.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -61,15 +61,19 @@ def mean_orbit(motion: Demonstrations) -> tuple[FloatArray, FloatArray]:
     lags = [np.zeros(len(k)) for k in cells]
     places = np.concatenate(cells) % GRID
     states = np.concatenate(paths)
+    # Pieces at a recording's ends cannot be shifted: they count where there is nothing else.
+    inside = [np.minimum(np.arange(len(k)), np.arange(len(k))[::-1]) for k in cells]
+    shares = np.clip(np.concatenate(inside) / (WINDOW + REACH), 1e-6, 1.0) ** 2
     for _ in range(ALIGNMENTS):
-        mean = _mean(places, states)
+        mean = _mean(places, states, shares)
         lags = [_lags(path, mean[k % GRID]) for path, k in zip(paths, cells, strict=True)]
-        late = _mean(places, np.concatenate(lags)[:, None])[:, 0]
+        late = _mean(places, np.concatenate(lags)[:, None], shares)[:, 0]
         lags = [lag - late[k % GRID] for lag, k in zip(lags, cells, strict=True)]
         states = np.concatenate([_shifted(p, lag) for p, lag in zip(paths, lags, strict=True)])
-    mean = _mean(places, states)
+    mean = _mean(places, states, shares)
     away = states - mean[places]
-    spread = _mean(places, (away[:, :, None] * away[:, None, :]).reshape(len(away), -1))
+    squares = (away[:, :, None] * away[:, None, :]).reshape(len(away), -1)
+    spread = _mean(places, squares, shares)
     n_rounds = len(states) / GRID
     tau = np.concatenate(lags).std() / GRID / np.sqrt(n_rounds)
     along = GRID / 2 * (np.roll(mean, -1, axis=0) - np.roll(mean, 1, axis=0))
@@ -79,10 +83,10 @@ def mean_orbit(motion: Demonstrations) -> tuple[FloatArray, FloatArray]:
     return mean[::every], covariance[::every]
 
 
-def _mean(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
-    """Return the mean of values (n, k) at each of GRID places, shape (GRID, k)."""
-    counts = np.bincount(places, minlength=GRID)
-    columns = [np.bincount(places, column, GRID) / counts for column in values.T]
+def _mean(places: NDArray[np.intp], values: FloatArray, shares: FloatArray) -> FloatArray:
+    """Return the weighted mean of values (n, k) at each of GRID places, shape (GRID, k)."""
+    totals = np.bincount(places, shares, GRID)
+    columns = [np.bincount(places, shares * column, GRID) / totals for column in values.T]
     return np.stack(columns, axis=1)
 
 
@@ -140,18 +144,19 @@ class MeanOrbit:
         among = torch.as_tensor(firsts, device=data.device).view(len(tasks), -1)
         self._recordings = among.repeat_interleave(N_PHASES, dim=1)
         self._n_motions = among.shape[1]
-        self._phases = 2 * math.pi * torch.arange(N_PHASES, device=data.device) / N_PHASES
+        u = torch.arange(N_PHASES, device=data.device) / N_PHASES
+        self._times = torch.where(u < 0.5, u, u - 1)  # in periods: a round, from -1/2 to 1/2
 
     def __call__(self, latent: LimitCycleLatent) -> Term:
         """Return the term of one step."""
         seen = self._points[..., ::ENCODED], self._recordings[:, ::ENCODED]
         z, _ = yield Points(*seen)
-        turned = torch.sign(latent.rate.detach())[:, None, None] * self._phases
+        turned = latent.rate[:, None, None] * self._times
         with torch.no_grad():
             angle = torch.atan2(z[:, 1], z[:, 0]).unflatten(1, (self._n_motions, -1))
             ahead = angle - turned[..., ::ENCODED]
             offset = torch.atan2(ahead.sin().mean(-1), ahead.cos().mean(-1))
-            psi = (turned + offset[..., None]).flatten(1)
+        psi = (turned + offset[..., None]).flatten(1)
         circle = latent.radius()[:, None, None] * torch.stack([psi.cos(), psi.sin()], dim=1)
         others = circle.new_zeros(len(circle), self._points.shape[1] - 2, circle.shape[2])
         cycle = torch.cat([circle, others], dim=1)
