@@ -7,11 +7,11 @@ density around it,
 
     h(rho* (cos, sin)(b u + psi0)) ~ N(c(u), S(u) + tau^2 c'(u) c'(u)^T + eps^2 I),
 
-c(u) the mean of the recordings at phase u, S(u) their spread about it, tau the standard error of its phase (theirs spread over the
-root of the number of rounds), and eps the resolution. So the
-orbit is held tightly where the recordings agree and loosely where they differ, and a round of the model, at
-the latent rate b over the times u in (-1/2, 1/2), takes their mean period. The phase psi0 is
-the circular mean of what the model takes c(u) for.
+c(u) the mean of the recordings at phase u, S(u) their spread about it, tau the standard error of
+its phase (theirs spread over the root of the number of rounds), and eps the resolution. So the
+orbit is held tightly where the recordings agree and loosely where they differ, and a round of the
+model, at the latent rate b over the times u in (-1/2, 1/2), takes their mean period. The phase
+psi0 is the circular mean of what the model takes c(u) for.
 
 Tempo varies within a round, which would blur turns in a mean over time. So pieces of the recordings
 are shifted in time to where their shape is the mean's, and the mean is taken again; it passes in
