@@ -20,8 +20,8 @@ by the mean duration of the motion's recordings. The objectives are those of
 
 For a motion that repeats, "reproduction" is the forward likelihood alone, over horizons up to one
 period, with the density of the state beside it: tempo varies from round to round, and a squared
-error over a round would shrink the orbit. In three dimensions and more the orbit itself is held to
-what the recordings have in common, as precisely as they agree (`mean_orbit`), in a second stage.
+error over a round would shrink the orbit. With an `orbit_weight` a second stage holds the orbit to
+what the recordings have in common, as precisely as they agree (`mean_orbit`).
 """
 
 from __future__ import annotations
@@ -168,8 +168,8 @@ def _train(
         max_norm=config.max_gradient_norm,
     )
     calm = Calm(data, N_CALM, config.calm_speed)
-    weight = config.weight_of_orbit(cyclic=data.cyclic, n_dims=data.n_dims)
-    orbit = MeanOrbit(tasks, data, config.orbit_resolution) if weight else None
+    held = data.cyclic and config.orbit_weight > 0
+    orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
     for step in range(n_steps):
         if stop.is_set():
             raise TrainingError("Training was stopped.")
@@ -178,7 +178,7 @@ def _train(
         weighted = _terms(config, step, latent, data, draws, calm)
         if orbit is not None and stage == ORBIT:
             assert isinstance(latent, LimitCycleLatent)
-            weighted.append((weight, orbit(latent)))
+            weighted.append((config.orbit_weight, orbit(latent)))
         weights, terms = zip(*weighted, strict=True)
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
@@ -242,8 +242,7 @@ def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
         return LIKELIHOOD
     if data.cyclic:
         n_steps = config.steps(cyclic=True)
-        held = config.weight_of_orbit(cyclic=True, n_dims=data.n_dims) > 0
-        return ORBIT if held and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
+        return ORBIT if config.orbit_weight > 0 and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
     n_steps = config.steps(cyclic=False)
     return WHOLE if step >= config.likelihood_fraction * n_steps else LIKELIHOOD
 

@@ -5,12 +5,14 @@ import pytest
 import torch
 
 from iflow_gym import Demonstrations
+from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
 from iflow_gym.baselines.imitation_flow.mean_orbit import N_PHASES, MeanOrbit, mean_orbit
 from iflow_gym.baselines.imitation_flow.passes import evaluate
+from iflow_gym.metrics import period
 
 PERIOD, DT = 2.0, 0.01
 
@@ -66,8 +68,8 @@ def test_error_counts_where_recordings_agree() -> None:
     assert losses[2] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_planar_cycles_keep_the_likelihood_alone() -> None:
-    config = ImitationFlowConfig()
-    assert config.weight_of_orbit(cyclic=True, n_dims=2) == 0.0
-    assert config.weight_of_orbit(cyclic=True, n_dims=3) == 1.0
-    assert config.weight_of_orbit(cyclic=False, n_dims=3) == 0.0
+def test_fit_with_the_term_goes_round_in_the_period() -> None:
+    motion = rounds()
+    system = ImitationFlow(n_steps=60, orbit_weight=1.0).fit(motion, seed=0)
+    path = system.rollout(motion.starts[:1], n_steps=1000, dt=DT)[0]
+    assert period(path[500:], DT) == pytest.approx(PERIOD, rel=0.02)
