@@ -20,7 +20,8 @@ by the mean duration of the motion's recordings. The objectives are those of
 
 For a motion that repeats, "reproduction" is the forward likelihood alone, over horizons up to one
 period, with the density of the state beside it: tempo varies from round to round, and a squared
-error over a round would shrink the orbit.
+error over a round would shrink the orbit. With an `orbit_weight` a second stage holds the orbit to
+what the recordings have in common, as precisely as they agree (`mean_orbit`).
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.guard import GuardedAdam, Restart, TrainingError
 from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
+from iflow_gym.baselines.imitation_flow.mean_orbit import MeanOrbit
 from iflow_gym.baselines.imitation_flow.objectives import (
     Calm,
     backward_likelihood,
@@ -68,7 +70,10 @@ with so many times the weight: that trains as well, in less time."""
 N_CALM = 32
 """States in a step's calm penalty."""
 
-LIKELIHOOD, WHOLE = 0, 1
+ORBIT_FRACTION = 0.3
+"""Share of a cycle's steps that maximise the likelihood alone before its orbit counts."""
+
+LIKELIHOOD, WHOLE, ORBIT = 0, 1, 2
 """Stages: losses are of one kind within each."""
 
 NOISE_STEPS = 100
@@ -163,14 +168,21 @@ def _train(
         max_norm=config.max_gradient_norm,
     )
     calm = Calm(data, N_CALM, config.calm_speed)
+    held = data.cyclic and config.orbit_weight > 0
+    orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
     for step in range(n_steps):
         if stop.is_set():
             raise TrainingError("Training was stopped.")
         draws.new_step()
-        weights, terms = zip(*_terms(config, step, latent, data, draws, calm), strict=True)
+        stage = _stage(config, step, data)
+        weighted = _terms(config, step, latent, data, draws, calm)
+        if orbit is not None and stage == ORBIT:
+            assert isinstance(latent, LimitCycleLatent)
+            weighted.append((config.orbit_weight, orbit(latent)))
+        weights, terms = zip(*weighted, strict=True)
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
-        adam.step(step, _stage(config, step, data), loss)
+        adam.step(step, stage, loss)
     adam.finish(n_steps)
     if _stage(config, n_steps, data) == WHOLE:
         _fit_noise(flow, latent, data, rngs)
@@ -225,9 +237,12 @@ def _terms(
 
 
 def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
-    """Whether a step minimises the likelihood or whole reproductions."""
-    if config.objective == "paper" or data.cyclic:
+    """Whether a step minimises the likelihood, whole reproductions, or the orbit's error too."""
+    if config.objective == "paper":
         return LIKELIHOOD
+    if data.cyclic:
+        n_steps = config.steps(cyclic=True)
+        return ORBIT if config.orbit_weight > 0 and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
     n_steps = config.steps(cyclic=False)
     return WHOLE if step >= config.likelihood_fraction * n_steps else LIKELIHOOD
 
