@@ -126,7 +126,7 @@ for following in path[1:]:
 
 ## What the scores mean
 A demonstration implies a score: where the bead of its stick comes down to a head is a note. Its
-replay by the arm hits every note within 2 ms. `env.unwrapped.score(system, seed=0)` rolls a policy
+replay by the arm hits every note within 1 ms. `env.unwrapped.score(system, seed=0)` rolls a policy
 out from each demonstration's start for eight periods, on the tip that the physics moves. The hits
 of as long as the demonstration lasts are compared with its score, those of the whole with the
 rhythm that the demonstrations have in common; beside them stand the metrics of
@@ -137,7 +137,7 @@ rhythm that the demonstrations have in common; beside them stand the metrics of
 {rows}
 
 `hit_f1` is strict: rounds last a few per cent more or less, so one demonstration played against
-another one's score gets 0.25 on average, and 0.62 at the best shift in time. A policy without a
+another one's score gets 0.18 on average, and 0.68 at the best shift in time. A policy without a
 clock cannot know which of them it is to follow; `rhythm_f1` and `tempo_error` say whether it
 drums.
 
@@ -208,7 +208,7 @@ the last period a rollout stays within 5 % of the diagonal of the recordings.
 
 **Drumming** adds the hits. `hit_f1` is strict: rounds last a few per cent more or less, and a
 policy without a clock cannot know which recording it is to follow, so that one recording played
-against another one's score gets 0.25. `rhythm_f1` asks for the rhythm that the recordings have in
+against another one's score gets 0.18. `rhythm_f1` asks for the rhythm that the recordings have in
 common, at any tempo, and `tempo_error` for the tempo.
 
 **Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,

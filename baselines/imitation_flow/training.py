@@ -38,7 +38,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
+from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
@@ -168,7 +168,8 @@ def _train(
         max_norm=config.max_gradient_norm,
     )
     calm = Calm(data, N_CALM, config.calm_speed)
-    held = data.cyclic and config.orbit_weight > 0
+    orbit_weight = _resolved(config, data).orbit_weight
+    held = data.cyclic and orbit_weight > 0
     orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
     for step in range(n_steps):
         if stop.is_set():
@@ -178,7 +179,7 @@ def _train(
         weighted = _terms(config, step, latent, data, draws, calm)
         if orbit is not None and stage == ORBIT:
             assert isinstance(latent, LimitCycleLatent)
-            weighted.append((config.orbit_weight, orbit(latent)))
+            weighted.append((orbit_weight, orbit(latent)))
         weights, terms = zip(*weighted, strict=True)
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
@@ -191,13 +192,14 @@ def _train(
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
-    n, d = len(tasks), tasks[0].n_dims
-    if not tasks[0].cyclic:
-        return LinearLatent(n, d, min_decay=config.min_decay)
-    latent = LimitCycleLatent(n, d, min_decay=config.min_decay)
+    n, d, cyclic = len(tasks), tasks[0].n_dims, tasks[0].cyclic
+    min_decay = config.resolved(cyclic=cyclic, n_dims=d).min_decay
+    if not cyclic:
+        return LinearLatent(n, d, min_decay=min_decay)
+    latent = LimitCycleLatent(n, d, min_decay=min_decay)
     # Times are in periods, by the main frequency, and the frame makes the first axes a circle.
     rates = torch.tensor([2 * math.pi * task.turns for task in tasks])
-    latent.initialise(rates, max(INITIAL_DECAY, 2 * config.min_decay), 1.0)
+    latent.initialise(rates, max(INITIAL_DECAY, 2 * min_decay), 1.0)
     return latent
 
 
@@ -231,8 +233,8 @@ def _terms(
         if config.tube_weight and turn == TURNS // 2:
             tube = reproduction(data, draws, max(n // 2, 1), width=config.tube_width)
             terms.append((TURNS * weight * config.tube_weight, tube))
-    if config.calm_weight:
-        terms.append((config.calm_weight, calm(draws)))
+    if calm_weight := _resolved(config, data).calm_weight:
+        terms.append((calm_weight, calm(draws)))
     return terms
 
 
@@ -242,9 +244,14 @@ def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
         return LIKELIHOOD
     if data.cyclic:
         n_steps = config.steps(cyclic=True)
-        return ORBIT if config.orbit_weight > 0 and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
+        held = _resolved(config, data).orbit_weight > 0
+        return ORBIT if held and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
     n_steps = config.steps(cyclic=False)
     return WHOLE if step >= config.likelihood_fraction * n_steps else LIKELIHOOD
+
+
+def _resolved(config: ImitationFlowConfig, data: Recordings) -> Resolved:
+    return config.resolved(cyclic=data.cyclic, n_dims=data.n_dims)
 
 
 def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:

@@ -20,7 +20,10 @@ the motors could do, it is what makes the arm gentle: on a drum head, which stop
 with at most about the tip's inertia (1.2 kg) times that, 25 N, whatever is commanded.
 
 Torques. tau = M (dq - dq_now) / dt + h brings the joints to dq within one control step, M the
-inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). Each joint's
+inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). Where the
+stick presses on a head, what that resists is held against by J^T times it a millisecond later, up
+to `HELD_AGAINST`: a stroke follows through a soft head as commanded, and what presses harder gives
+way. (The real arm has torque sensors in its joints, and a loop of 1 kHz around them.) Each joint's
 torque is cut at its motor's limit; commands in free space stay well below.
 """
 
@@ -42,6 +45,9 @@ POSTURE: Final = np.array([0.0, -0.72, 0.0, -2.4, 0.0, 0.47, 0.0])
 
 TIP_ACCELERATION: Final = 20.0
 """Greatest acceleration of the tip that a command brings about, in m/s^2."""
+
+HELD_AGAINST: Final = 10.0
+"""Greatest force of a head that the motors hold against, in N."""
 
 ORIENTATION_GAIN: Final = 15.0
 """k in 1/s."""
@@ -181,14 +187,26 @@ class Controller:
         high = np.minimum((self._upper - q) / BRAKING_TIME, SPEED_LIMITS)
         return np.minimum(low, SPEED_LIMITS), np.maximum(high, -SPEED_LIMITS)
 
-    def torque(self, velocity: FloatArray) -> FloatArray:
-        """Return the torques that bring the joints to `velocity` within a control step."""
+    def torque(self, velocity: FloatArray, resistance: FloatArray | None = None) -> FloatArray:
+        """Return the torques that bring the joints to `velocity` within a control step.
+
+        `resistance` is a force on the tip in N, shape (3,), that is held against.
+        """
         data = self.data
         change = (velocity - data.qvel) / CONTROL_DT
         mujoco.mj_mulM(self.scene.model, data, self._moved, change)
         torque = self.going_on() + self._moved
-        limited: FloatArray = np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
-        return limited
+        if resistance is not None:
+            torque += self._holding(resistance)
+        return _limited(torque)
+
+    def held(self, torque: FloatArray, resistance: FloatArray) -> FloatArray:
+        """Return torques with what holds against a force on the tip, shape (3,) in N."""
+        return _limited(torque + self._holding(resistance))
+
+    def _holding(self, resistance: FloatArray) -> FloatArray:
+        torque: FloatArray = -self.jacobian()[:3].T @ _shortened(resistance, HELD_AGAINST)
+        return torque
 
     def going_on(self) -> FloatArray:
         """Return h, the torques that keep the joint velocities, shape (7,)."""
@@ -211,6 +229,11 @@ class Controller:
         scale = _largest_scale(kept, CONTROL_DT * both[1], low, high)
         target = kept + scale * CONTROL_DT * both[1]
         return self.torque(target), scale
+
+
+def _limited(torque: FloatArray) -> FloatArray:
+    limited: FloatArray = np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
+    return limited
 
 
 def _shortened(vector: FloatArray, most: float) -> FloatArray:

@@ -49,11 +49,11 @@ HAND_PITCH: Final = np.radians(20.0)
 STICK_PITCH: Final = np.radians(20.0)
 """The stick points forward, and this much down."""
 
-HEAD_CONTACT: Final = {"solref": "-330 -13", "solimp": "0.1 0.1 0.001", "friction": "0.4"}
+HEAD_CONTACT: Final = {"solref": "-300 -25", "solimp": "0.1 0.1 0.001", "friction": "0.4"}
 """Contact of stick and head: a mesh head, which gives way as a spring with a damper. MuJoCo takes
-both per inertia, and the low impedance leaves that nearly as it is. Pressed by the arm, a head
-gives way by 0.5 N/mm (0.7 from 1 cm on, where the stick's neck lies on it too); struck at 0.12 m/s,
-it takes 2 N at once."""
+both per inertia; the low impedance leaves the inertia nearly as it is. Pressed by the arm, a head
+gives way by 2.2 mm/N (1.6 from 1 cm on, where the stick's neck lies on it too); struck at 0.1 m/s,
+it takes about 3 N at once."""
 
 HEAD_DEPTH: Final = 0.05
 """How far a head gives way, in m; there the shell stops the stick."""

@@ -7,18 +7,19 @@ published: two drums 0.275 m apart; over a high arch (0.22 m above the heads) to
 2.8 s, over a low one (0.09 m) back to the left in 2.25 s; 100 Hz, 10 s, begun near the top of the
 high arch. Tempo and heights differ from recording to recording, strokes from round to round.
 
-So are its turns: a person does not turn on the spot, but follows through. The recorded hand is within
-1 cm of its lowest point for 0.38 s on the right and 0.30 s on the left, at 0.02 m/s there, its way
-up 3 to 4 mm beside its way down at that height. Here these are 0.29 s, 0.04 and 0.02 m/s, 3 to 5 mm.
+So are its turns: a person does not turn on the spot, but follows through. The recorded hand is
+within 1 cm of its lowest point for 0.38 s on the right and for 0.30 s on the left, moving at
+0.02 m/s there, and its way up is 4 mm beside its way down at that height. Here these are 0.32 and
+0.31 s, 0.01 and 0.02 m/s, and 5 and 4 mm.
 
-A stroke from one head to the other takes s from 0 to 1. Height is an arch whose ends are rounded,
+A stroke from one head to the other takes s from 0 to 1. Height is an arch with rounded ends,
 
     H (sqrt(sin(pi s)^2 + r^2) - r) / (sqrt(1 + r^2) - r).
 
 Across, the hand first lifts and then goes over: the minimum-jerk polynomial
-10 s^3 - 15 s^4 + 6 s^5. The lowest point wanted is 16 mm below where the stick meets the head, which
-lets it come to 8 to 12. The hand's command is the velocity of this path plus a pull of 10/s towards
-it. What is stored is the simulated tip.
+10 s^3 - 15 s^4 + 6 s^5. The lowest point wanted is 10 to 16 mm into a head, which gives way. The
+hand's command is the velocity of this path plus a pull of 10/s towards it. What is stored is the
+simulated tip.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ LEANS: Final = (-0.02, 0.005)
 """How far an arch leans forward at its top, in m."""
 SPOTS: Final = ((0.672, -0.138), (0.690, 0.138))
 """Where the right and the left head are hit, x and y in m."""
-ROUNDNESS: Final = (0.14, 0.08)
+ROUNDNESS: Final = (0.42, 0.19)
 """r at the ends of the high and the low arch."""
-DEPTH: Final = 0.016
+DEPTH: Final = 0.013
 """How far below first contact the hand aims, in m: it follows through."""
 PULL: Final = 10.0
 """Of the hand towards its path, in 1/s."""
@@ -151,7 +152,7 @@ def record(index: int) -> tuple[FloatArray, list[float]]:
         now, following = hand.at(k * CONTROL_DT), hand.at((k + 1) * CONTROL_DT)
         velocity = (following - now) / CONTROL_DT + PULL * (now - simulation.tip)
         command = simulation.controller.joint_command(velocity)
-        simulation.advance(simulation.controller.torque(command.velocity))
+        simulation.advance(simulation.controller.torque(command.velocity), holding=True)
     return path, hand.rounds
 
 

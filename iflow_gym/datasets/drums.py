@@ -40,7 +40,7 @@ DRUMS: Final = (RIGHT, LEFT)
 """The kit of `iflow/Drumming-v0`; a hit's `drum` is an index into it."""
 
 FILE: Final = "drums.npz"
-SHA256: Final = "889df8d5e5e5438e031cd9092f99448495f5c52abe199593e3626bdd5280160d"
+SHA256: Final = "d55113f8b0a2c9fe41e4435bfeb79845a5dd38275f406daa7cea6248a4fe1f2e"
 
 
 @lru_cache(maxsize=1)

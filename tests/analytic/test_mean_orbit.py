@@ -6,7 +6,7 @@ import torch
 
 from iflow_gym import Demonstrations
 from iflow_gym.baselines.imitation_flow import ImitationFlow
-from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
+from iflow_gym.baselines.imitation_flow.config import ELSEWHERE, ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
@@ -58,7 +58,7 @@ def test_error_counts_where_recordings_agree() -> None:
     data = Recordings([task], torch.device("cpu"))
     config = ImitationFlowConfig()
     flow = make_flow(config, 3, 0, [torch.Generator().manual_seed(0)], cyclic=True)
-    latent = LimitCycleLatent(1, 3, min_decay=config.min_decay)
+    latent = LimitCycleLatent(1, 3, min_decay=0.05)
     latent.initialise(2 * np.pi * task.turns, 3.0, 1.0)
     losses = [
         evaluate(flow, latent, data, [MeanOrbit([task], data, resolution)(latent)])[0].item()
@@ -73,3 +73,30 @@ def test_fit_with_the_term_goes_round_in_the_period() -> None:
     system = ImitationFlow(n_steps=60, orbit_weight=1.0).fit(motion, seed=0)
     path = system.rollout(motion.starts[:1], n_steps=1000, dt=DT)[0]
     assert period(path[500:], DT) == pytest.approx(PERIOD, rel=0.02)
+
+
+def test_defaults_are_of_the_kind_of_motion() -> None:
+    config = ImitationFlowConfig()
+    in_space = config.resolved(cyclic=True, n_dims=3)
+    assert in_space.orbit_weight > 0
+    assert in_space.min_decay > 1
+    plane, ends = config.resolved(cyclic=True, n_dims=2), config.resolved(cyclic=False, n_dims=3)
+    assert plane == ends == ELSEWHERE
+    assert ImitationFlowConfig(objective="paper").resolved(cyclic=True, n_dims=3) == ELSEWHERE
+    given = ImitationFlowConfig(orbit_weight=0.0, calm_weight=0.5, min_decay=1.0)
+    assert given.resolved(cyclic=True, n_dims=3) == (0.5, 0.0, 1.0)
+
+
+def test_a_cycle_in_space_comes_back_from_beside_the_recordings() -> None:
+    """Recordings that lie beside one another all the way do not make the orbit forget to."""
+    motion = rounds()
+    offsets = np.array([[0.0, 0.0, 0.1 * k] for k in np.linspace(-1, 1, 6)])
+    paths = [p + offset for p, offset in zip(motion.positions, offsets, strict=True)]
+    lasting = Demonstrations.from_arrays(paths, dt=DT, period=PERIOD)
+    system = ImitationFlow(n_steps=60).fit(lasting, seed=0)
+    turn = round(PERIOD / DT)
+    starts = lasting.starts[[0, -1]]
+    paths = system.rollout(starts, n_steps=2 * turn, dt=DT)
+    apart = np.linalg.norm(paths[0] - paths[1], axis=1)
+    beside = np.linalg.norm(starts[0] - starts[1])
+    assert apart[-turn // 4 :].max() < 0.2 * beside

@@ -314,15 +314,50 @@ def test_pressing_on_a_head_is_gentle(env):
     assert np.linalg.norm((observation - first)[:2]) < 0.1  # it creeps
 
 
+def test_a_head_gives_way_as_a_spring_and_the_arm_goes_on_as_commanded(env):
+    """Down at 0.05 m/s from 2 mm above: the tip keeps its speed while the head pushes back."""
+    start = np.array([*DRUMS[0].head[:2], DRUMS[0].head[2] + TIP_RADIUS + 0.002])
+    env.reset(options={"start": start})
+    depths, forces = [], []
+    for _ in range(26):
+        observation, *_, info = env.step(env.velocity_to_action([0.0, 0.0, -0.05]))
+        depths.append(DRUMS[0].head[2] + TIP_RADIUS - observation[2])
+        forces.append(info["forces"][0])
+    depth, force = np.array(depths), np.array(forces)
+    assert depth[-1] > 0.010
+    np.testing.assert_allclose(np.diff(depth)[2:], 0.05 * env.dt, rtol=0.1)
+    assert (force[depth < 0] == 0).all()
+    deep = (depth > 0.002) & (depth < 0.008)  # the bead alone touches
+    stiffness, damping = np.polyfit(depth[deep], force[deep], 1)
+    assert stiffness == pytest.approx(450, rel=0.1)  # N/m
+    assert 0.5 < damping < 2.5  # N, of 0.05 m/s
+
+
+def test_resting_on_a_head_the_arm_holds_its_place(env):
+    """Pressed 8 mm in and told to stand still, the stick is not lifted out."""
+    start = np.array([*DRUMS[1].head[:2], DRUMS[1].head[2] + TIP_RADIUS + 0.002])
+    env.reset(options={"start": start})
+    for _ in range(20):
+        before, *_ = env.step(env.velocity_to_action([0.0, 0.0, -0.05]))
+    for _ in range(50):
+        after, *_, info = env.step(np.zeros(3))
+    assert info["forces"][1] > 2.0
+    assert abs(after[2] - before[2]) < 0.001
+
+
 def test_torque_mode_does_what_velocity_mode_does():
+    """Until the stick meets a head, and nearly so from then on."""
     one, other = DrummingEnv(), DrummingEnv(control_mode="torque")
     starts = [e.reset(options={"demonstration": 0})[0] for e in (one, other)]
     path = one.demonstrations.positions[0]
     a, b = starts
+    met = False
     for following in path[1:200]:
-        a, *_ = one.step(one.command_to_action((following - a) / one.dt, a))
+        a, *_, info = one.step(one.command_to_action((following - a) / one.dt, a))
         b, *_ = other.step(other.command_to_action((following - b) / other.dt, b))
-    np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
+        met = met or info["forces"].max() > 0
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-3 if met else 1e-6)
+    assert met
 
 
 def test_no_torque_lets_the_arm_hang_in_the_air():
