@@ -18,7 +18,7 @@ from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, load_drums
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.envs.drumming import recorded
 from iflow_gym.envs.drumming.arguments import OBSERVABLES, ForcePush
-from iflow_gym.envs.drumming.control import JOINT_MARGIN, Workspace
+from iflow_gym.envs.drumming.control import BRAKING_TIME, JOINT_MARGIN, Workspace
 from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, assets_folder
 from iflow_gym.envs.drumming.simulation import UnreachableError
@@ -247,31 +247,55 @@ def test_the_tip_moves_as_commanded(env, direction):
     assert np.abs(env.simulation.controller.rotation_error()).max() < 2e-3
 
 
-def test_unreachable_commands_saturate_and_let_go(env):
-    """Pushed against the border for 3 s the arm stands still there; one step back frees it."""
+def test_commands_out_of_the_workspace_end_at_its_border_and_let_go(env):
+    """Pushed against the border for 3 s the tip stays inside; one step back frees it."""
     for direction in np.vstack([np.eye(3), -np.eye(3), [[1.0, 1.0, 1.0]]]):
         env.reset(options={"start": MID_AIR})
         for _ in range(300):
             observation, *_, info = env.step(direction)
         assert Workspace.contains(observation + 0.02 * (MID_AIR - observation))
-        assert info["command_scale"] < 0.1
-        assert np.linalg.norm(env.simulation.tip_velocity) < 0.05
+        assert info["command_scale"] < 0.5
+        assert np.linalg.norm(env.simulation.tip_velocity) < 0.2
         before = observation
         for _ in range(10):
             observation, *_ = env.step(-0.3 * direction)
         assert (observation - before) @ -direction > 0.01
 
 
-def test_a_command_that_is_slowed_is_not_bent(env):
-    """Towards a corner of the workspace: the way stays a straight line to where it ends."""
-    direction = np.array([0.3, 1.0, 0.8])
-    env.reset(options={"start": MID_AIR})
-    path = np.array([env.step(direction)[0] for _ in range(150)])
-    unit = direction / np.linalg.norm(direction)
-    offset = path - MID_AIR
-    aside = offset - np.outer(offset @ unit, unit)
-    assert np.linalg.norm(offset[-1]) > 0.15
-    assert np.linalg.norm(aside, axis=1).max() < 0.01
+def test_along_the_border_a_command_slides(env):
+    """Out and aside at once: the way out ends at the border, the way aside goes on."""
+    start = np.array([Workspace.low[0] + 0.01, 0.0, 0.42])
+    env.reset(options={"start": start})
+    velocity = np.array([-0.1, 0.1, 0.0])
+    path = np.array([env.step(env.velocity_to_action(velocity))[0] for _ in range(100)])
+    assert (path[:, 0] >= Workspace.low[0] - 1e-4).all()
+    assert path[-1, 0] < Workspace.low[0] + 0.002
+    np.testing.assert_allclose(np.diff(path[5:, 1]) / env.dt, 0.1, atol=0.005)
+    np.testing.assert_allclose(path[:, 2], start[2], atol=2e-3)
+
+
+def test_what_slides_is_cut_by_no_more_than_leads_out():
+    rng = np.random.default_rng(0)
+    size = Workspace.high - Workspace.low
+    points = Workspace.low + size * rng.uniform(0.0, 1.0, (400, 3))
+    cut = 0
+    for point in points[Workspace.contains(points)]:
+        velocity = rng.normal(size=3)
+        allowed = Workspace.slid(point, velocity)
+        after = point + BRAKING_TIME * allowed
+        assert (after >= Workspace.low - 1e-9).all()
+        assert (after <= Workspace.high + 1e-9).all()
+        arm = point - Workspace.centre
+        length = np.linalg.norm(arm)
+        if after[0] > Workspace.low[0] + 1e-6:  # there both borders cannot always be kept
+            assert length + BRAKING_TIME * (allowed @ arm) / length <= Workspace.radius + 1e-9
+        if (allowed == velocity).all():
+            continue
+        cut += 1
+        assert np.linalg.norm(allowed) < np.linalg.norm(velocity)
+    assert 100 < cut < 300
+    middle = np.array([0.72, 0.0, 0.40])
+    np.testing.assert_array_equal(Workspace.slid(middle, np.full(3, 0.3)), np.full(3, 0.3))
 
 
 @both_modes
@@ -327,9 +351,9 @@ def test_a_head_gives_way_as_a_spring_and_the_arm_goes_on_as_commanded(env):
     assert depth[-1] > 0.010
     np.testing.assert_allclose(np.diff(depth)[2:], 0.05 * env.dt, rtol=0.1)
     assert (force[depth < 0] == 0).all()
-    deep = (depth > 0.002) & (depth < 0.008)  # the bead alone touches
+    deep = (depth > 0.001) & (depth < 0.005)  # the bead alone touches
     stiffness, damping = np.polyfit(depth[deep], force[deep], 1)
-    assert stiffness == pytest.approx(450, rel=0.1)  # N/m
+    assert stiffness == pytest.approx(450, rel=0.2)  # N/m
     assert 0.5 < damping < 2.5  # N, of 0.05 m/s
 
 
