@@ -120,8 +120,10 @@ def forces_of(force: Any, infos: list[dict], dt: float, title: str) -> None:
     for drum, colour in enumerate(COLOURS):
         force.fill_between(dt * np.arange(1, len(forces) + 1), forces[:, drum], color=colour,
                            linewidth=1.2, label=DRUMS[drum].name)  # fmt: skip
-    force.set(xlabel="time (s)", ylabel="force (N)", ylim=(0, None))
-    force.legend(title=title, frameon=False, fontsize=8, title_fontsize=8, loc="upper right")
+    force.set(xlabel="time (s)", ylabel="force (N)", ylim=(0, 1.6 * forces.max()))
+    force.legend(
+        title=title, frameon=False, fontsize=8, title_fontsize=8, loc="upper right", ncols=2
+    )
 
 
 def still() -> None:
