@@ -88,7 +88,7 @@ def test_defaults_are_of_the_kind_of_motion() -> None:
 
 
 def test_a_cycle_in_space_comes_back_within_a_period() -> None:
-    """The distance to the latent cycle falls by exp(-4) in a period at least, whatever is fitted."""
+    """The distance to the latent cycle falls by exp(-4) in a period at least."""
     motion = rounds()
     starts = motion.starts + np.array([0.2, -0.1, 0.3])
     left = []
