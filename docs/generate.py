@@ -126,7 +126,7 @@ for following in path[1:]:
 
 ## What the scores mean
 A demonstration implies a score: where the bead of its stick comes down to a head is a note. Its
-replay by the arm hits every note within 2 ms. `env.unwrapped.score(system, seed=0)` rolls a policy
+replay by the arm hits every note within 1 ms. `env.unwrapped.score(system, seed=0)` rolls a policy
 out from each demonstration's start for eight periods, on the tip that the physics moves. The hits
 of as long as the demonstration lasts are compared with its score, those of the whole with the
 rhythm that the demonstrations have in common; beside them stand the metrics of
@@ -137,16 +137,42 @@ rhythm that the demonstrations have in common; beside them stand the metrics of
 {rows}
 
 `hit_f1` is strict: rounds last a few per cent more or less, so one demonstration played against
-another one's score gets 0.25 on average, and 0.62 at the best shift in time. A policy without a
+another one's score gets 0.18 on average, and 0.68 at the best shift in time. A policy without a
 clock cannot know which of them it is to follow; `rhythm_f1` and `tempo_error` say whether it
 drums.
 
 ## What is learned so far
-No method of this suite drums yet. They learn the cycle: ImitationFlow's period is off by 2 %, and
-from most starts and after pushes the arm comes back to it. But a stroke is a turn of 30 ms at the
-head, and every orbit is rounder there: ImitationFlow's lowest points stay 5 to 15 mm above the
-heads, with coupling and with autoregressive layers, and hit nothing. The orbit field grazes them,
-and hits some. It is an open problem of this environment, not a fault in your installation.
+![ImitationFlow drums](images/drumming-learned.gif)
+
+*ImitationFlow's third round, with autoregressive layers: its field is what moves the arm.*
+
+![Its path among the demonstrations, and when it hits which drum](images/drumming-learned.png)
+
+ImitationFlow with its default settings, seeds 0, 1 and 2, fitted on the six demonstrations and
+scored on them by `env.unwrapped.score(system, seed=0)`:
+
+| | autoregressive layers | coupling layers |
+| --- | --- | --- |
+| `rhythm_f1` | 1.00, 0.99, 1.00 | 1.00, 0.99, 0.98 |
+| `sequence_f1` | 1.00, 1.00, 1.00 | 0.93, 1.00, 1.00 |
+| mean time from that rhythm, ms | 20, 48, 27 | 7, 34, 46 |
+| `hit_f1` | 0.25, 0.25, 0.29 | 0.14, 0.33, 0.25 |
+| `period_error`, % | 0.3, 0.3, 0.4 | 0.6, 1.3, 0.8 |
+| `orbit_distance`, mm | 12, 12, 12 | 13, 12, 12 |
+| `attraction`, 100 starts | 0.96, 0.85, 0.32 | 0.99, 0.83, 0.86 |
+| `perturbation_recovery` | 1.00, 1.00, 0.75 | 1.00, 0.92, 1.00 |
+
+They drum. What is not reached: `hit_f1`, in absolute time, stays near a quarter, since the start
+of a recording says nothing of its tempo, and the first hit comes up to 0.2 s off. Half of the
+seeds are 30 to 50 ms from the rhythm at its best shift. Every start that was looked at comes to the
+orbit in the closed form; in the scene some do not, since the field knows neither the drums nor the
+border of the workspace: it leads the stick through a drum, or out of the workspace, and there it
+stays pressed. How many do depends on the seed. And the fields are fast in places beside the orbit,
+7 to 16 times the demonstrations' peak at most within twice their box, less than 10 times in all but
+a thousandth of it.
+
+The orbit field hits the drums in their order and at the right tempo, but the left one too late in
+the round: where way down and way up lie side by side the nearest point of the orbit leaps.
 
 ## Pictures
 `render_mode="rgb_array"` needs OpenGL, everything else does not. Without a display, EGL (Debian's
@@ -208,7 +234,7 @@ the last period a rollout stays within 5 % of the diagonal of the recordings.
 
 **Drumming** adds the hits. `hit_f1` is strict: rounds last a few per cent more or less, and a
 policy without a clock cannot know which recording it is to follow, so that one recording played
-against another one's score gets 0.25. `rhythm_f1` asks for the rhythm that the recordings have in
+against another one's score gets 0.18. `rhythm_f1` asks for the rhythm that the recordings have in
 common, at any tempo, and `tempo_error` for the tempo.
 
 **Methods that use time** follow a clock and have no field: what is asked of a field (SEDS' error,

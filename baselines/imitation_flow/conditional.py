@@ -246,7 +246,8 @@ class ConditionalImitationFlow:
             raise ValueError(f"expected angles and out_weight of shapes {settings}, got {found}")
         generators = [torch.Generator().manual_seed(0)]
         flow = make_flow(self.config, n_dims, k, generators)
-        latent = LinearLatent(1, n_dims, min_decay=self.config.min_decay)
+        min_decay = self.config.resolved(cyclic=False, n_dims=n_dims).min_decay
+        latent = LinearLatent(1, n_dims, min_decay=min_decay)
         for part, module in (("flow", flow), ("latent", latent)):
             named = {
                 name.removeprefix(f"{part}."): torch.as_tensor(np.array(array))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 Objective = Literal["reproduction", "paper"]
 Emission = Literal["coupling", "autoregressive", "spline"]
@@ -18,6 +18,19 @@ SHARPNESS, CYCLE_SHARPNESS = 3.0, 1.5
 """Default of `sharpness`, where motions end and where they repeat."""
 
 Noise = Literal["additive", "vanishing"]
+
+
+class Resolved(NamedTuple):
+    """Settings whose defaults depend on the kind of motion."""
+
+    calm_weight: float
+    orbit_weight: float
+    min_decay: float
+
+
+ELSEWHERE: Final = Resolved(calm_weight=0.3, orbit_weight=0.0, min_decay=0.05)
+IN_SPACE: Final = Resolved(calm_weight=4.0, orbit_weight=0.2, min_decay=4.0)
+"""Where motions repeat in three dimensions and more."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +81,22 @@ class ImitationFlowConfig:
     and close in at constant speed. 0 leaves it out."""
     tube_width: float = 0.05
     """Standard deviation of the distance to the start, in half the motion's size."""
-    calm_weight: float = 0.3
-    """Weight of the penalty on speed away from the demonstrations. 0 leaves it out."""
+    calm_weight: float | None = None
+    """Weight of the penalty on speed away from the demonstrations. 0 leaves it out. None takes 0.3,
+    and 4 for motions that repeat in space, beside the orbit's likelihood."""
     calm_speed: float = 1.5
     """Speeds up to this multiple of the demonstrations' peak cost nothing."""
-    min_decay: float = 0.05
-    """Slowest decay of the latent system, per duration: eps in A = -(L L^T + eps I) + S - S^T."""
+    orbit_weight: float | None = None
+    """Weight of the likelihood of the whole orbit for motions that repeat, in a second stage: see
+    `mean_orbit`. 0 leaves it out. None takes 0, and 0.2 in three dimensions and more
+    ("reproduction" only)."""
+    orbit_resolution: float = 0.02
+    """Standard deviation to which the orbit is held where all recordings agree."""
+    min_decay: float | None = None
+    """Slowest decay of the latent system, per duration: eps in A = -(L L^T + eps I) + S - S^T. None
+    takes 0.05, and 4 for motions that repeat in three dimensions and more: recordings of them lie
+    beside one another from beginning to end, which by itself reads as if nothing came back to the
+    orbit within a round."""
     noise: Noise = "additive"
     """"additive": K dB, the state is bounded around the attractor in distribution. "vanishing":
     noise in proportion to the distance from the attractor, the state comes to rest there."""
@@ -105,10 +128,11 @@ class ImitationFlowConfig:
             raise ValueError(f"Expected the name of a device, got {self.device!r}.")
         for name in (
             "log_scale_bound", "sharpness", "learning_rate", "max_gradient_norm", "min_decay",
-            "calm_speed", "tube_width", "spline_bound",
+            "calm_speed", "tube_width", "spline_bound", "orbit_resolution",
         ):  # fmt: skip
             value = getattr(self, name)
-            if not (name == "sharpness" and value is None) and not 0 < value < math.inf:
+            open_ = name in ("sharpness", "min_decay") and value is None
+            if not open_ and not 0 < value < math.inf:
                 raise ValueError(f"Expected a finite {name} > 0, got {value}.")
         if self.log_scale_bound > MOST_LOG_SCALE:
             raise ValueError(
@@ -119,9 +143,20 @@ class ImitationFlowConfig:
             raise ValueError(
                 f"Expected likelihood_fraction in [0, 1], got {self.likelihood_fraction}."
             )
-        for name in ("likelihood_weight", "tube_weight", "calm_weight", "end_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"Expected a finite {name} >= 0, got {getattr(self, name)}.")
+        for name in (
+            "likelihood_weight", "tube_weight", "calm_weight", "end_weight", "orbit_weight",
+        ):  # fmt: skip
+            value = getattr(self, name)
+            open_ = name in ("calm_weight", "orbit_weight") and value is None
+            if not open_ and not 0 <= value < math.inf:
+                raise ValueError(f"Expected a finite {name} >= 0, got {value}.")
+
+    def resolved(self, *, cyclic: bool, n_dims: int) -> Resolved:
+        """Return what `calm_weight`, `orbit_weight` and `min_decay` are for a kind of motion."""
+        in_space = cyclic and n_dims > 2 and self.objective == "reproduction"
+        usual = IN_SPACE if in_space else ELSEWHERE
+        given = {name: getattr(self, name) for name in Resolved._fields}
+        return usual._replace(**{name: v for name, v in given.items() if v is not None})
 
     def steps(self, *, cyclic: bool) -> int:
         """Return the steps of Adam for motions that repeat or end."""

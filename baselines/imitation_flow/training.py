@@ -20,7 +20,8 @@ by the mean duration of the motion's recordings. The objectives are those of
 
 For a motion that repeats, "reproduction" is the forward likelihood alone, over horizons up to one
 period, with the density of the state beside it: tempo varies from round to round, and a squared
-error over a round would shrink the orbit.
+error over a round would shrink the orbit. With an `orbit_weight` a second stage holds the orbit to
+what the recordings have in common, as precisely as they agree (`mean_orbit`).
 """
 
 from __future__ import annotations
@@ -37,13 +38,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
+from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.guard import GuardedAdam, Restart, TrainingError
 from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
+from iflow_gym.baselines.imitation_flow.mean_orbit import MeanOrbit
 from iflow_gym.baselines.imitation_flow.objectives import (
     Calm,
     backward_likelihood,
@@ -68,7 +70,10 @@ with so many times the weight: that trains as well, in less time."""
 N_CALM = 32
 """States in a step's calm penalty."""
 
-LIKELIHOOD, WHOLE = 0, 1
+ORBIT_FRACTION = 0.3
+"""Share of a cycle's steps that maximise the likelihood alone before its orbit counts."""
+
+LIKELIHOOD, WHOLE, ORBIT = 0, 1, 2
 """Stages: losses are of one kind within each."""
 
 NOISE_STEPS = 100
@@ -172,14 +177,22 @@ def _train(
         max_norm=config.max_gradient_norm,
     )
     calm = Calm(data, N_CALM, config.calm_speed)
+    orbit_weight = _resolved(config, data).orbit_weight
+    held = data.cyclic and orbit_weight > 0
+    orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
     for step in range(n_steps):
         if stop.is_set():
             raise TrainingError("Training was stopped.")
         draws.new_step()
-        weights, terms = zip(*_terms(config, step, latent, data, draws, calm), strict=True)
+        stage = _stage(config, step, data)
+        weighted = _terms(config, step, latent, data, draws, calm)
+        if orbit is not None and stage == ORBIT:
+            assert isinstance(latent, LimitCycleLatent)
+            weighted.append((orbit_weight, orbit(latent)))
+        weights, terms = zip(*weighted, strict=True)
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
-        adam.step(step, _stage(config, step, data), loss)
+        adam.step(step, stage, loss)
         if len(adam.failures) == len(tasks):
             return [adam.failures[m] for m in range(len(tasks))]
     adam.finish(n_steps)
@@ -193,13 +206,14 @@ def _train(
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
-    n, d = len(tasks), tasks[0].n_dims
-    if not tasks[0].cyclic:
-        return LinearLatent(n, d, min_decay=config.min_decay)
-    latent = LimitCycleLatent(n, d, min_decay=config.min_decay)
+    n, d, cyclic = len(tasks), tasks[0].n_dims, tasks[0].cyclic
+    min_decay = config.resolved(cyclic=cyclic, n_dims=d).min_decay
+    if not cyclic:
+        return LinearLatent(n, d, min_decay=min_decay)
+    latent = LimitCycleLatent(n, d, min_decay=min_decay)
     # Times are in periods, by the main frequency, and the frame makes the first axes a circle.
     rates = torch.tensor([2 * math.pi * task.turns for task in tasks])
-    latent.initialise(rates, max(INITIAL_DECAY, 2 * config.min_decay), 1.0)
+    latent.initialise(rates, max(INITIAL_DECAY, 2 * min_decay), 1.0)
     return latent
 
 
@@ -233,17 +247,25 @@ def _terms(
         if config.tube_weight and turn == TURNS // 2:
             tube = reproduction(data, draws, max(n // 2, 1), width=config.tube_width)
             terms.append((TURNS * weight * config.tube_weight, tube))
-    if config.calm_weight:
-        terms.append((config.calm_weight, calm(draws)))
+    if calm_weight := _resolved(config, data).calm_weight:
+        terms.append((calm_weight, calm(draws)))
     return terms
 
 
 def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
-    """Whether a step minimises the likelihood or whole reproductions."""
-    if config.objective == "paper" or data.cyclic:
+    """Whether a step minimises the likelihood, whole reproductions, or the orbit's error too."""
+    if config.objective == "paper":
         return LIKELIHOOD
+    if data.cyclic:
+        n_steps = config.steps(cyclic=True)
+        held = _resolved(config, data).orbit_weight > 0
+        return ORBIT if held and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
     n_steps = config.steps(cyclic=False)
     return WHOLE if step >= config.likelihood_fraction * n_steps else LIKELIHOOD
+
+
+def _resolved(config: ImitationFlowConfig, data: Recordings) -> Resolved:
+    return config.resolved(cyclic=data.cyclic, n_dims=data.n_dims)
 
 
 def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:

@@ -10,9 +10,11 @@ eqs. 3.54 and 3.59; the damping grows towards a singularity as in Nakamura & Han
 lambda = lambda_0 (1 - w / w_0) where the manipulability w = sqrt(det J J^T) is below w_0, else 0).
 
 Limits. dq = a + s b, b the part that v commands and a the rest. s in [0, 1] is the largest number
-with which every joint keeps its speed limit and its distance to its stops, and the tip its distance
-to the workspace's border: near a stop or the border the allowed approach is (distance) / 0.1 s.
-So a command that cannot be carried out is slowed as a whole, and never bent.
+with which every joint keeps its speed limit and its distance to its stops: near a stop the allowed
+approach is (distance) / 0.1 s. So a command that cannot be carried out is slowed as a whole, and
+never bent. The border of the workspace alone is slid along: what of v leads out of it faster than
+(distance) / 0.1 s is taken off, and the rest remains. Slowed as a whole a policy would stand still
+there for ever, since the tip's position is all that it goes by.
 
 Acceleration. v is not the command itself but the tip's present velocity plus the change to the
 command, shortened, along the command and across it, to `TIP_ACCELERATION` dt each. Far below what
@@ -20,7 +22,10 @@ the motors could do, it is what makes the arm gentle: on a drum head, which stop
 with at most about the tip's inertia (1.2 kg) times that, 25 N, whatever is commanded.
 
 Torques. tau = M (dq - dq_now) / dt + h brings the joints to dq within one control step, M the
-inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). Each joint's
+inertia and h what the arm needs to go on as it goes (gravity is compensated anyway). Where the
+stick presses on a head, what that resists is held against by J^T times it a millisecond later, up
+to `HELD_AGAINST`: a stroke follows through a soft head as commanded, and what presses harder gives
+way. (The real arm has torque sensors in its joints, and a loop of 1 kHz around them.) Each joint's
 torque is cut at its motor's limit; commands in free space stay well below.
 """
 
@@ -43,6 +48,9 @@ POSTURE: Final = np.array([0.0, -0.72, 0.0, -2.4, 0.0, 0.47, 0.0])
 TIP_ACCELERATION: Final = 20.0
 """Greatest acceleration of the tip that a command brings about, in m/s^2."""
 
+HELD_AGAINST: Final = 10.0
+"""Greatest force of a head that the motors hold against, in N."""
+
 ORIENTATION_GAIN: Final = 15.0
 """k in 1/s."""
 POSTURE_GAIN: Final = 1.0
@@ -63,7 +71,7 @@ class JointCommand(NamedTuple):
     velocity: FloatArray
     """rad/s, shape (7,)."""
     scale: float
-    """s in [0, 1]: how much of the command is carried out."""
+    """In [0, 1]: how much of the command is carried out, s times what the border lets through."""
 
 
 class Workspace:
@@ -87,22 +95,23 @@ class Workspace:
         return inside & near
 
     @classmethod
-    def scale(cls, point: FloatArray, velocity: FloatArray) -> float:
-        """Return how much of a velocity is allowed at a point."""
-        worst = 1.0
-        for x, v, low, high in zip(point.tolist(), velocity.tolist(), _LOW, _HIGH, strict=True):
-            outward = v * BRAKING_TIME
-            if outward > high - x and v > 0:
-                worst = min(worst, max(high - x, 0.0) / outward)
-            elif outward < low - x and v < 0:
-                worst = min(worst, min(low - x, 0.0) / outward)
+    def slid(cls, point: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the part of a velocity that is allowed at a point: what leads out is cut down."""
+        boxed = cls._boxed(point, velocity)
         arm = point - cls.centre
         length = float(np.sqrt(arm @ arm))
-        outward = float(arm @ velocity) / length * BRAKING_TIME
-        gap = cls.radius - length
-        if outward > gap and outward > 0:
-            worst = min(worst, max(gap, 0.0) / outward)
-        return worst
+        excess = float(arm @ boxed) / length - max(cls.radius - length, 0.0) / BRAKING_TIME
+        if excess <= 0.0:
+            return boxed
+        return cls._boxed(point, boxed - (excess / length) * arm)
+
+    @staticmethod
+    def _boxed(point: FloatArray, velocity: FloatArray) -> FloatArray:
+        allowed = [
+            min(max(v, min(low - x, 0.0) / BRAKING_TIME), max(high - x, 0.0) / BRAKING_TIME)
+            for x, v, low, high in zip(point.tolist(), velocity.tolist(), _LOW, _HIGH, strict=True)
+        ]
+        return np.array(allowed)
 
 
 _LOW: Final = Workspace.low.tolist()
@@ -138,15 +147,16 @@ class Controller:
         wanted[:, 0] = -jacobian @ resting
         wanted[3:, 0] += ORIENTATION_GAIN * self.rotation_error()
         velocity = self._eased(velocity, jacobian)
-        wanted[:3, 1] = velocity
+        allowed = Workspace.slid(data.site_xpos[self.scene.tip], velocity)
+        wanted[:3, 1] = allowed
         task = jacobian.T @ np.linalg.solve(self._damped(jacobian), wanted)
         low, high = self.speed_limits()
         free = np.minimum(np.maximum(resting + task[:, 0], low), high)
         commanded = task[:, 1]
         scale = _largest_scale(free, commanded, low, high)
-        if scale > 0.0:
-            scale = min(scale, Workspace.scale(data.site_xpos[self.scene.tip], velocity))
-        return JointCommand(free + scale * commanded, scale)
+        speed = float(np.sqrt(velocity @ velocity))
+        share = float(np.sqrt(allowed @ allowed)) / speed if speed > 0 else 1.0
+        return JointCommand(free + scale * commanded, scale * min(share, 1.0))
 
     def _eased(self, velocity: FloatArray, jacobian: FloatArray) -> FloatArray:
         """Return the velocity that the tip's acceleration limit lets it have after this step."""
@@ -181,14 +191,26 @@ class Controller:
         high = np.minimum((self._upper - q) / BRAKING_TIME, SPEED_LIMITS)
         return np.minimum(low, SPEED_LIMITS), np.maximum(high, -SPEED_LIMITS)
 
-    def torque(self, velocity: FloatArray) -> FloatArray:
-        """Return the torques that bring the joints to `velocity` within a control step."""
+    def torque(self, velocity: FloatArray, resistance: FloatArray | None = None) -> FloatArray:
+        """Return the torques that bring the joints to `velocity` within a control step.
+
+        `resistance` is a force on the tip in N, shape (3,), that is held against.
+        """
         data = self.data
         change = (velocity - data.qvel) / CONTROL_DT
         mujoco.mj_mulM(self.scene.model, data, self._moved, change)
         torque = self.going_on() + self._moved
-        limited: FloatArray = np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
-        return limited
+        if resistance is not None:
+            torque += self._holding(resistance)
+        return _limited(torque)
+
+    def held(self, torque: FloatArray, resistance: FloatArray) -> FloatArray:
+        """Return torques with what holds against a force on the tip, shape (3,) in N."""
+        return _limited(torque + self._holding(resistance))
+
+    def _holding(self, resistance: FloatArray) -> FloatArray:
+        torque: FloatArray = -self.jacobian()[:3].T @ _shortened(resistance, HELD_AGAINST)
+        return torque
 
     def going_on(self) -> FloatArray:
         """Return h, the torques that keep the joint velocities, shape (7,)."""
@@ -211,6 +233,11 @@ class Controller:
         scale = _largest_scale(kept, CONTROL_DT * both[1], low, high)
         target = kept + scale * CONTROL_DT * both[1]
         return self.torque(target), scale
+
+
+def _limited(torque: FloatArray) -> FloatArray:
+    limited: FloatArray = np.minimum(np.maximum(torque, -TORQUE_LIMITS), TORQUE_LIMITS)
+    return limited
 
 
 def _shortened(vector: FloatArray, most: float) -> FloatArray:

@@ -50,15 +50,16 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     ## Description
     A seven-joint Franka arm stands before two drums with a stick in its hand, in MuJoCo. The
     motion is that of the ImitationFlow paper's robot experiment: an arch between the drums, high
-    over on the way to the right one, low on the way back, a sharp turn on either head, about 5 s a
+    over on the way to the right one, low on the way back, a stroke on either head, about 5 s a
     round. A policy sees where the stick's tip is and says how it should move; a controller turns
     that into torques of the joints, with the stick's orientation held. A good policy goes round on
     the demonstrated orbit, comes back to it after a push, and hits each drum when the
     demonstrations do.
 
     Physics run at 1 kHz, control at 100 Hz. Lengths are metres in the frame of the arm's base: x
-    forward, y to the left, z up. The head of a drum gives way softly, and stops the tip: what a
-    command asks beyond it becomes force.
+    forward, y to the left, z up. The heads are of mesh, as on electronic drums: they give way by
+    2 mm/N, with damping, and a stroke follows through, 11 to 14 mm into the head. The arm holds
+    against a head with up to 10 N, and gives way to more.
 
     `env.unwrapped` has `demonstrations`, `drums`, `dt`, `max_speed`, `n_dims`, the conversions
     `velocity_to_action`, `action_to_velocity` and `command_to_action`, `score_of` (the notes that
@@ -74,12 +75,12 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     | `"torque"` | `Box(-1, 1, (7,), float32)` | torque of a joint | -limit | limit |
 
     A velocity is held for a control step; the arm reaches it at the step's end, or accelerates
-    towards it by 20 m/s^2. Where a joint's stop, a joint's speed limit or the border of the
-    workspace is near, the command is slowed as a whole (`info["command_scale"]`), never bent:
-    `iflow_gym.envs.drumming.control` has the equations. Torques, of up to 87 N m (joints 1 to 4)
-    and 12 N m (5 to 7), come on top of the compensation of gravity; they too are scaled as a whole
-    so that the joints keep their limits. A collision can make a joint faster than its limit for an
-    instant; no joint reaches its stop.
+    towards it by 20 m/s^2. Where a joint's stop or a joint's speed limit is near, the command is
+    slowed as a whole (`info["command_scale"]`), never bent; along the border of the workspace it
+    slides. `iflow_gym.envs.drumming.control` has the equations. Torques, of up to 87 N m (joints 1
+    to 4) and 12 N m (5 to 7), come on top of the compensation of gravity; they are scaled as a
+    whole so that the joints keep their limits. A collision can make a joint faster than its limit
+    for an instant; no joint reaches its stop.
 
     ## Observation Space
     `Box(float64)`, the parts that `observe` names, in its order; the tip comes first always.
@@ -341,8 +342,10 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         if not self._running:
             raise gymnasium.error.ResetNeeded(self._resets_needed)
         wanted = scaled_into_box(command / MAX_SPEED) * MAX_SPEED
-        controller = self.simulation.controller
-        torque: FloatArray = controller.torque(controller.joint_command(wanted).velocity)
+        simulation = self.simulation
+        controller = simulation.controller
+        velocity = controller.joint_command(wanted).velocity
+        torque = controller.torque(velocity, simulation.resistance)
         action: FloatArray = torque / TORQUE_LIMITS
         return action
 
@@ -444,7 +447,8 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._count += 1
         pushing = self._count in self._push_steps
         is_force = isinstance(self.perturbation, ForcePush)
-        hits = simulation.advance(torque, self._push if pushing and is_force else None)
+        force = self._push if pushing and is_force else None
+        hits = simulation.advance(torque, force, holding=self.control_mode == "velocity")
         reached = simulation.tip
         measures = self._measures(reached)
         reward = self._guide.reward(

@@ -4,8 +4,8 @@ Placement. The recording is in the frame of another robot. It is shifted by `SHI
 nor scaled, so that the middle between the drums is straight ahead and the strokes lie where the arm
 moves well. Then a drum is set under the strokes of either side: its centre is their mean, and its
 head so high that the highest of them reaches 2 mm beyond first contact. The recorded turns differ
-in height by 1.5 cm on the right and 3.3 cm on the left, so others aim up to 3.5 cm into the head:
-there the drum stops the tip, and the arm presses.
+in height by 1.5 cm on the right and 3.3 cm on the left, so others follow through up to 3.5 cm into
+the head; the arm lets the deepest of them go less deep.
 """
 
 from __future__ import annotations

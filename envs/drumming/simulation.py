@@ -50,6 +50,7 @@ class Simulation:
         self._silent = (0.0,) * len(drums)
         self._detector = HitDetector(len(drums), PHYSICS_DT)
         self._force = np.zeros(6)
+        self._resistance = np.zeros(3)
 
     # State --------------------------------------------------------------------------------
 
@@ -74,6 +75,7 @@ class Simulation:
         """
         self._detector.reset()
         self.peak_forces = [0.0] * len(self._silent)
+        self._resistance = np.zeros(3)
         mujoco.mj_resetData(self.model, self.data)
         self._solve(tip, POSTURE)
         self._check_clear(tip)
@@ -86,6 +88,7 @@ class Simulation:
     def displace(self, by: FloatArray) -> None:
         """Move the tip aside at once, joint velocities kept, as far as arm and drums allow."""
         start, posture = self.tip, self.data.qpos.copy()
+        self._resistance = np.zeros(3)
         for share in np.linspace(1.0, 0.0, 21):
             self.data.qpos[:] = posture
             try:
@@ -147,24 +150,36 @@ class Simulation:
 
     # Motion -------------------------------------------------------------------------------
 
-    def advance(self, torque: FloatArray, push: FloatArray | None = None) -> list[Hit]:
+    @property
+    def resistance(self) -> FloatArray:
+        """Force of the heads on the stick in N, shape (3,), at the end of the last step."""
+        return self._resistance.copy()
+
+    def advance(
+        self, torque: FloatArray, push: FloatArray | None = None, *, holding: bool = False
+    ) -> list[Hit]:
         """Hold torques, and a force in N on the tip, for a control step.
 
-        Returns the hits that were decided in it: a hit is reported when the window of its peak
-        force has passed.
+        With `holding` the motors hold against the heads' resistance at each physics step. Returns
+        the hits that were decided: a hit is reported when the window of its peak force has passed.
         """
         model, data, detector = self.model, self.data, self._detector
         data.ctrl[:] = torque
         data.qfrc_applied[:] = 0.0 if push is None else self.controller.jacobian()[:3].T @ push
         peaks = list(self._silent)
         hits: list[Hit] = []
+        resisted = holding and bool(self._resistance.any())
         for _ in range(SUBSTEPS):
+            if resisted:
+                data.ctrl[:] = self.controller.held(torque, self._resistance)
             mujoco.mj_step2(model, data)
             if data.ncon:
                 forces: Sequence[float] = self._head_forces()
                 peaks = list(map(max, peaks, forces))
+                resisted = holding
             else:
                 forces = self._silent
+                self._resistance[:] = 0.0
             hits += detector.update(forces)
             mujoco.mj_step1(model, data)
         self.peak_forces = peaks
@@ -175,13 +190,18 @@ class Simulation:
         return self._detector.flush()
 
     def _head_forces(self) -> list[float]:
-        """Return the normal force of the stick on each head in N."""
+        """Return the normal force of the stick on each head in N; note what they do to the tip."""
         scene, forces = self.scene, list(self._silent)
+        self._resistance[:] = 0.0
         for index, (first, second) in enumerate(self.data.contact.geom.tolist()):
             drum = scene.head_geoms.get(first, scene.head_geoms.get(second, -1))
             if drum >= 0 and (first in scene.stick_geoms or second in scene.stick_geoms):
                 mujoco.mj_contactForce(self.model, self.data, index, self._force)
                 forces[drum] += float(self._force[0])
+                # In a contact's frame the force is that of the first geom on the second.
+                on_stick = 1.0 if second in scene.stick_geoms else -1.0
+                frame = self.data.contact.frame[index].reshape(3, 3)
+                self._resistance += on_stick * self._force[:3] @ frame
         return forces
 
 

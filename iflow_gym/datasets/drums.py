@@ -40,7 +40,7 @@ DRUMS: Final = (RIGHT, LEFT)
 """The kit of `iflow/Drumming-v0`; a hit's `drum` is an index into it."""
 
 FILE: Final = "drums.npz"
-SHA256: Final = "2004da04fc2ada7052a3526d995377d3be39f7c89634410b32875c876aa4f9c6"
+SHA256: Final = "d55113f8b0a2c9fe41e4435bfeb79845a5dd38275f406daa7cea6248a4fe1f2e"
 
 
 @lru_cache(maxsize=1)

@@ -415,11 +415,13 @@ def rhythm_f1(
     notes_on = np.tile(np.arange(len(shares)), len(rounds))
     # A note in the last moment may still be played after it.
     until = max(end - tolerance, last + tolerance)
+    # What matches changes only where a note is at the tolerance from a hit.
     for time, drum in zip(times.tolist(), drums.tolist(), strict=True):
-        start = first + (time - shares[drum] * found - first) % found
-        notes_at = (start + (rounds[:, None] + shares) * found).ravel()
-        due = (notes_at >= first - tolerance) & (notes_at <= until)
-        best = max(best, hit_f1(notes_at[due], notes_on[due], times, drums, tolerance))
+        for early in (0.0, -tolerance, tolerance):
+            start = first + (time + early - shares[drum] * found - first) % found
+            notes_at = (start + (rounds[:, None] + shares) * found).ravel()
+            due = (notes_at >= first - tolerance - 1e-9) & (notes_at <= until + 1e-9)
+            best = max(best, hit_f1(notes_at[due], notes_on[due], times, drums, tolerance))
     return best
 
 

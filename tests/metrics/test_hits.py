@@ -338,6 +338,14 @@ class TestRhythm:
         for tempo in (0.7, 1.0, 1.4):
             assert m.rhythm_f1([0.0, 0.4], tempo * times + 9.0, drums, 5.0, 30 * tempo + 9) == 1.0
 
+    def test_the_shift_is_the_one_that_matches_best(self):
+        """Drum 1 is 80 ms late: 40 ms on either side fit into 50, and 60 ms do not."""
+        times, drums = STEADY
+        for late, f1 in ((0.08, 1.0), (-0.08, 1.0), (0.12, 0.5), (-0.12, 0.5)):
+            played = np.where(drums == 1, times + late, times)
+            found = m.rhythm_f1([0.0, 0.4], played, drums, 5.0, 30.0)
+            assert found == pytest.approx(f1, abs=0.05)
+
     def test_what_is_uneven_missing_doubled_or_misplaced_costs(self):
         times, drums = STEADY
         assert m.rhythm_f1([0.0, 0.6], times, drums, 5.0, 30.0) == pytest.approx(0.5, abs=0.05)
