@@ -32,8 +32,8 @@ class Options:
     """Steps of training; several give the curve of accuracy against seconds."""
     calm: bool = True
     """False leaves the calm penalty out, for comparison."""
-    n_threads: int = 1
-    """Threads that all shapes are trained on."""
+    n_jobs: int = 1
+    """Processes that all shapes are dealt out to."""
 
 
 def inverse_error(system: ImitationFlow, grid: np.ndarray, dtype: type) -> float:
@@ -59,7 +59,7 @@ def measure(options: Options, seed: int, n_steps: int) -> None:
     motions = [load_lasa(shape) for shape in SINGLE_MOTIONS]
     splits = [motion.split(options.protocol) for motion in motions]
     settings = {} if options.calm else {"calm_weight": 0.0}
-    method = ImitationFlow(n_steps=n_steps, n_threads=options.n_threads, **settings)
+    method = ImitationFlow(n_steps=n_steps, n_jobs=options.n_jobs, **settings)
     began, cpu = time.perf_counter(), time.process_time()
     systems = method.fit_many([s.fit for s in splits], seeds=[seed] * len(motions))
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
@@ -89,7 +89,7 @@ def measure(options: Options, seed: int, n_steps: int) -> None:
     restarts = sum(len(system.restarts_) for system in systems)
     print(
         f"{len(motions)} shapes, {options.protocol}, seed {seed}, {n_steps} steps: {seconds:.0f} s "
-        f"({cpu:.0f} s of CPU) on {options.n_threads} threads, {restarts} restarts\n",
+        f"({cpu:.0f} s of CPU) in {options.n_jobs} processes, {restarts} restarts\n",
         flush=True,
     )
 
@@ -97,7 +97,7 @@ def measure(options: Options, seed: int, n_steps: int) -> None:
 def main() -> None:
     """Measure every combination of seeds and steps."""
     options = tyro.cli(Options, description=__doc__)
-    torch.set_num_threads(options.n_threads)
+    torch.set_num_threads(1)
     for n_steps in options.n_steps:
         for seed in options.seeds:
             measure(options, seed, n_steps)

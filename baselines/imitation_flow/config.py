@@ -11,7 +11,7 @@ Emission = Literal["coupling", "autoregressive", "spline"]
 MOST_LOG_SCALE = 2.0
 """With 2 the inverse has been seen to be off by more than the motion's size in single precision."""
 
-STEPS, CYCLE_STEPS = 5000, 1500
+STEPS, CYCLE_STEPS = 4500, 1500
 """Default of `n_steps`, where motions end and where they repeat."""
 
 SHARPNESS, CYCLE_SHARPNESS = 3.0, 1.5
@@ -28,7 +28,10 @@ class Resolved(NamedTuple):
     min_decay: float
 
 
-ELSEWHERE: Final = Resolved(calm_weight=0.3, orbit_weight=0.0, min_decay=0.05)
+ENDS: Final = Resolved(calm_weight=2.5, orbit_weight=0.0, min_decay=0.05)
+"""Where motions end."""
+IN_PLANE: Final = Resolved(calm_weight=0.3, orbit_weight=0.0, min_decay=0.05)
+"""Where motions repeat in the plane."""
 IN_SPACE: Final = Resolved(calm_weight=4.0, orbit_weight=0.2, min_decay=4.0)
 """Where motions repeat in three dimensions and more."""
 
@@ -59,7 +62,7 @@ class ImitationFlowConfig:
     larger bends sharper corners and generalises less. None takes 3 where motions end and 1.5 where
     they repeat: recorded cycles are followed as well, and the field around them waves less."""
     n_steps: int | None = None
-    """Steps of Adam. None takes 5000 where motions end and 1500 where they repeat, which is one
+    """Steps of Adam. None takes 4500 where motions end and 1500 where they repeat, which is one
     stage instead of two."""
     likelihood_fraction: float = 0.2
     """Share of the steps that maximise the likelihood before the reproduction error is minimised
@@ -74,6 +77,12 @@ class ImitationFlowConfig:
     """Transitions in a step's likelihood."""
     n_times: int = 40
     """Times of each demonstration in a step's reproduction error."""
+    error_power: float = 3.0
+    """The squared errors e of a reproduction over time count as (mean e^p)^(1/p): with p = 1 as
+    their mean, with more as the worst of them."""
+    timing_weight: float = 0.6
+    """Weight of the squared error along the recording, beside 1 across it: to be early or late
+    counts less than to be elsewhere."""
     end_weight: float = 0.7
     """Weight of the squared error at the last sample, beside the mean over times."""
     tube_weight: float = 0.05
@@ -82,8 +91,9 @@ class ImitationFlowConfig:
     tube_width: float = 0.05
     """Standard deviation of the distance to the start, in half the motion's size."""
     calm_weight: float | None = None
-    """Weight of the penalty on speed away from the demonstrations. 0 leaves it out. None takes 0.3,
-    and 4 for motions that repeat in space, beside the orbit's likelihood."""
+    """Weight of the penalty on speed away from the demonstrations. 0 leaves it out. None takes
+    2.5 where motions end, 0.3 where they repeat in the plane, and 4 where they repeat in space,
+    beside the orbit's likelihood."""
     calm_speed: float = 1.5
     """Speeds up to this multiple of the demonstrations' peak cost nothing."""
     orbit_weight: float | None = None
@@ -100,8 +110,8 @@ class ImitationFlowConfig:
     noise: Noise = "additive"
     """"additive": K dB, the state is bounded around the attractor in distribution. "vanishing":
     noise in proportion to the distance from the attractor, the state comes to rest there."""
-    n_threads: int = 1
-    """Threads that models trained together are dealt out to, on a CPU."""
+    n_jobs: int = 1
+    """Processes that models trained together are dealt out to, each with one thread."""
     device: str = "auto"
     """Where training runs: "auto" takes a GPU where torch has one; or a torch device."""
 
@@ -116,7 +126,7 @@ class ImitationFlowConfig:
             "n_steps",
             "n_pairs",
             "n_times",
-            "n_threads",
+            "n_jobs",
             "n_bins",
         ):
             value, least = getattr(self, name), 2 if name == "n_bins" else 1
@@ -128,7 +138,7 @@ class ImitationFlowConfig:
             raise ValueError(f"Expected the name of a device, got {self.device!r}.")
         for name in (
             "log_scale_bound", "sharpness", "learning_rate", "max_gradient_norm", "min_decay",
-            "calm_speed", "tube_width", "spline_bound", "orbit_resolution",
+            "calm_speed", "tube_width", "spline_bound", "orbit_resolution", "error_power",
         ):  # fmt: skip
             value = getattr(self, name)
             open_ = name in ("sharpness", "min_decay") and value is None
@@ -145,6 +155,7 @@ class ImitationFlowConfig:
             )
         for name in (
             "likelihood_weight", "tube_weight", "calm_weight", "end_weight", "orbit_weight",
+            "timing_weight",
         ):  # fmt: skip
             value = getattr(self, name)
             open_ = name in ("calm_weight", "orbit_weight") and value is None
@@ -153,8 +164,8 @@ class ImitationFlowConfig:
 
     def resolved(self, *, cyclic: bool, n_dims: int) -> Resolved:
         """Return what `calm_weight`, `orbit_weight` and `min_decay` are for a kind of motion."""
-        in_space = cyclic and n_dims > 2 and self.objective == "reproduction"
-        usual = IN_SPACE if in_space else ELSEWHERE
+        in_space = n_dims > 2 and self.objective == "reproduction"
+        usual = (IN_SPACE if in_space else IN_PLANE) if cyclic else ENDS
         given = {name: getattr(self, name) for name in Resolved._fields}
         return usual._replace(**{name: v for name, v in given.items() if v is not None})
 

@@ -7,6 +7,8 @@ Algorithm 1's (paper, eqs. 6 and 7).
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -110,43 +112,69 @@ def reproduction(
     draws: Draws,
     n_times: int,
     *,
-    width: float | None = None,
+    power: float = 1.0,
+    timing_weight: float = 1.0,
     end_weight: float = 0.0,
 ) -> Term:
     """Squared error of whole reproductions at stratified times.
 
-    With a width it is the tube's: starts are moved by a normal offset of that width, and the target
-    is the recording beside which the offset shrinks in proportion to the time that is left. With an
-    `end_weight` the squared error at the last sample counts by itself: the motion has to be over
-    then, which random times see too seldom.
+    Its part along the recording, which is an error in time, counts `timing_weight`; a recording's
+    errors e over the times count as (mean e^p)^(1/p). With an `end_weight` the squared error at the
+    last sample counts by itself: the motion has to be over then, which random times see too seldom.
+    """
+    everybody = everyone(data)
+    starts = data.at(everybody, torch.zeros_like(everybody))
+    samples = _samples(data, draws, n_times)
+    ends = (data.lengths - 1)[..., None]
+    made, target, along = yield from _reproduced(data, starts, torch.cat([samples, ends], dim=-1))
+    error = made - target
+    squares = error.square().sum(1)
+    late = (error * along).sum(1).square() / along.square().sum(1).clamp_min(1e-12)
+    squares, late = (x.unflatten(1, (data.n_recordings, -1)) for x in (squares, late))
+    weighted = (squares - (1 - timing_weight) * late)[..., :-1].clamp_min(0.0)
+    errors = (weighted.pow(power).mean(-1) + 1e-16).pow(1 / power)
+    return errors.mean(1) + end_weight * squares[..., -1].mean(1)
+
+
+def tube(data: Recordings, draws: Draws, n_times: int, *, width: float) -> Term:
+    """Squared error of whole reproductions from beside the recordings' starts.
+
+    Starts are moved by a normal offset of the width, and the target is the recording beside which
+    the offset shrinks in proportion to the time that is left.
     """
     n, everybody = data.n_recordings, everyone(data)
-    starts = data.at(everybody, torch.zeros_like(everybody))
-    offset = None
-    if width is not None:
-        normal = math.sqrt(2) * torch.erfinv(1.998 * draws.uniform(data.n_dims, n) - 0.999)
-        offset = width * normal
-        starts = starts + offset
+    normal = math.sqrt(2) * torch.erfinv(1.998 * draws.uniform(data.n_dims, n) - 0.999)
+    offset = width * normal
+    starts = data.at(everybody, torch.zeros_like(everybody)) + offset
+    samples = _samples(data, draws, n_times)
+    left = 1 - samples.float() / (data.lengths - 1).float()[..., None]
+    made, target, _ = yield from _reproduced(data, starts, samples)
+    target = target + (offset[..., None] * left[:, None]).flatten(2)
+    return (made - target).square().sum(1).mean(1)
+
+
+def _samples(data: Recordings, draws: Draws, n_times: int) -> Tensor:
+    """Draw samples (m, n, n_times) of each recording, one in each stratum, not the first."""
     strata = (torch.arange(n_times, device=data.device) + draws.uniform(n_times)) / n_times
     spans = (data.lengths - 1)[..., None]
-    samples = torch.minimum(1 + (strata[:, None] * spans).long(), spans)
-    if end_weight:
-        samples = torch.cat([samples, spans], dim=-1)
-        n_times += 1
+    return torch.minimum(1 + (strata[:, None] * spans).long(), spans)
+
+
+def _reproduced(
+    data: Recordings, starts: Tensor, samples: Tensor
+) -> Generator[Points | Starts, Any, tuple[Tensor, Tensor, Tensor]]:
+    """Ask for what is made of starts (m, d, n) at samples (m, n, q) of the recordings.
+
+    Returns it, the recordings, and their steps there, each (m, d, n q).
+    """
+    everybody, n_times = everyone(data), samples.shape[-1]
     samples = samples.flatten(1)
     among = everybody[..., None].expand(-1, -1, n_times).flatten(1)
     times = torch.gather(data.steps, 1, among) * samples
     target = data.at(among, samples)
-    if offset is not None:
-        left = 1 - strata[:, None, None]
-        target = target + (offset[..., None] * left).flatten(2)
     z, _ = yield Points(starts, everybody)
     made = yield Starts(z.repeat_interleave(n_times, dim=-1), times, among)
-    squares = (made - target).square().sum(1)
-    if end_weight:
-        squares = squares.unflatten(1, (n, n_times))
-        return squares[..., :-1].mean((1, 2)) + end_weight * squares[..., -1].mean(1)
-    return squares.mean(1)
+    return made, target, target - data.at(among, samples - 1)
 
 
 class Calm:

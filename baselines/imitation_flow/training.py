@@ -27,14 +27,13 @@ what the recordings have in common, as precisely as they agree (`mean_orbit`).
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -54,10 +53,11 @@ from iflow_gym.baselines.imitation_flow.objectives import (
     random_pairs,
     reproduction,
     stationary,
+    tube,
 )
 from iflow_gym.baselines.imitation_flow.passes import Term, encode, evaluate
 
-SQUARED_ERROR_WEIGHT = 100.0
+SQUARED_ERROR_WEIGHT = 300.0
 """Weight of the squared error, against which the penalties are measured."""
 
 N_HORIZONS = 14
@@ -106,28 +106,16 @@ def train(
     repeat. A model whose training diverges again and again is returned as an error, to be raised
     or collected: the others are trained to the end.
 
-    On a CPU a batch takes one thread: its tensors are small, and threads that wait for each other
-    within an operation made a fit ten times as slow on a busy machine. With more threads the models
-    are dealt out to as many batches.
+    A batch takes one thread: its tensors are small, and threads that wait for each other within an
+    operation made a fit ten times as slow on a busy machine. With `n_jobs` the models are dealt out
+    to as many processes: threads of one process would wait for each other's Python.
     """
-    n_batches = min(config.n_threads, len(tasks))
+    n_batches = min(config.n_jobs, len(tasks))
     dealt = [range(k, len(tasks), n_batches) for k in range(n_batches)]
-
-    stop = threading.Event()
-
-    def batch(indices: range) -> list[Trained | TrainingError]:
-        torch.set_num_threads(1)  # a new thread begins with the process's number
-        return _train(config, [tasks[i] for i in indices], [rngs[i] for i in indices], stop)
-
-    with _one_thread():
-        if n_batches == 1:
-            batches = [batch(dealt[0])]
-        else:
-            with ThreadPoolExecutor(n_batches) as threads:
-                try:
-                    batches = list(threads.map(batch, dealt))
-                finally:
-                    stop.set()
+    batches = Parallel(n_batches)(
+        delayed(_train)(config, [tasks[i] for i in indices], [rngs[i] for i in indices])
+        for indices in dealt
+    )
     order = [i for indices in dealt for i in indices]
     models = [model for models in batches for model in models]
     return [model for _, model in sorted(zip(order, models, strict=True), key=lambda pair: pair[0])]
@@ -152,10 +140,14 @@ def _one_thread() -> Iterator[None]:
 
 
 def _train(
-    config: ImitationFlowConfig,
-    tasks: Sequence[Task],
-    rngs: Sequence[np.random.Generator],
-    stop: threading.Event,
+    config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
+) -> list[Trained | TrainingError]:
+    with _one_thread():
+        return _train_batch(config, tasks, rngs)
+
+
+def _train_batch(
+    config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
 ) -> list[Trained | TrainingError]:
     device = torch.device(
         ("cuda" if torch.cuda.is_available() else "cpu")
@@ -181,8 +173,6 @@ def _train(
     held = data.cyclic and orbit_weight > 0
     orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
     for step in range(n_steps):
-        if stop.is_set():
-            raise TrainingError("Training was stopped.")
         draws.new_step()
         stage = _stage(config, step, data)
         weighted = _terms(config, step, latent, data, draws, calm)
@@ -242,11 +232,18 @@ def _terms(
         terms.append((1.0, stationary(latent, data, draws, q * p)))
     if whole:
         n, weight = config.n_times, SQUARED_ERROR_WEIGHT
-        error = reproduction(data, draws, n, end_weight=config.end_weight)
+        error = reproduction(
+            data,
+            draws,
+            n,
+            power=config.error_power,
+            timing_weight=config.timing_weight,
+            end_weight=config.end_weight,
+        )
         terms.append((weight, error))
         if config.tube_weight and turn == TURNS // 2:
-            tube = reproduction(data, draws, max(n // 2, 1), width=config.tube_width)
-            terms.append((TURNS * weight * config.tube_weight, tube))
+            beside = tube(data, draws, max(n // 2, 1), width=config.tube_width)
+            terms.append((TURNS * weight * config.tube_weight, beside))
     if calm_weight := _resolved(config, data).calm_weight:
         terms.append((calm_weight, calm(draws)))
     return terms

@@ -6,7 +6,7 @@ import torch
 
 from iflow_gym import Demonstrations
 from iflow_gym.baselines.imitation_flow import ImitationFlow
-from iflow_gym.baselines.imitation_flow.config import ELSEWHERE, ImitationFlowConfig
+from iflow_gym.baselines.imitation_flow.config import ENDS, IN_PLANE, ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
@@ -81,8 +81,8 @@ def test_defaults_are_of_the_kind_of_motion() -> None:
     assert in_space.orbit_weight > 0
     assert in_space.min_decay > 1
     plane, ends = config.resolved(cyclic=True, n_dims=2), config.resolved(cyclic=False, n_dims=3)
-    assert plane == ends == ELSEWHERE
-    assert ImitationFlowConfig(objective="paper").resolved(cyclic=True, n_dims=3) == ELSEWHERE
+    assert (plane, ends) == (IN_PLANE, ENDS)
+    assert ImitationFlowConfig(objective="paper").resolved(cyclic=True, n_dims=3) == IN_PLANE
     given = ImitationFlowConfig(orbit_weight=0.0, calm_weight=0.5, min_decay=1.0)
     assert given.resolved(cyclic=True, n_dims=3) == (0.5, 0.0, 1.0)
 
