@@ -11,7 +11,7 @@ Emission = Literal["coupling", "autoregressive", "spline"]
 MOST_LOG_SCALE = 2.0
 """With 2 the inverse has been seen to be off by more than the motion's size in single precision."""
 
-STEPS, CYCLE_STEPS = 4500, 1500
+STEPS, CYCLE_STEPS = 5000, 1500
 """Default of `n_steps`, where motions end and where they repeat."""
 
 SHARPNESS, CYCLE_SHARPNESS = 3.0, 1.5
@@ -62,7 +62,7 @@ class ImitationFlowConfig:
     larger bends sharper corners and generalises less. None takes 3 where motions end and 1.5 where
     they repeat: recorded cycles are followed as well, and the field around them waves less."""
     n_steps: int | None = None
-    """Steps of Adam. None takes 4500 where motions end and 1500 where they repeat, which is one
+    """Steps of Adam. None takes 5000 where motions end and 1500 where they repeat, which is one
     stage instead of two."""
     likelihood_fraction: float = 0.2
     """Share of the steps that maximise the likelihood before the reproduction error is minimised
