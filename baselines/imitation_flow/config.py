@@ -80,7 +80,7 @@ class ImitationFlowConfig:
     error_power: float = 3.0
     """The squared errors e of a reproduction over time count as (mean e^p)^(1/p): with p = 1 as
     their mean, with more as the worst of them."""
-    timing_weight: float = 0.6
+    timing_weight: float = 0.7
     """Weight of the squared error along the recording, beside 1 across it: to be early or late
     counts less than to be elsewhere."""
     end_weight: float = 0.7
