@@ -11,6 +11,9 @@ Emission = Literal["coupling", "autoregressive", "spline"]
 MOST_LOG_SCALE = 2.0
 """With 2 the inverse has been seen to be off by more than the motion's size in single precision."""
 
+MOST_ERROR_POWER = 4.0
+"""With more the powers of small errors are below single precision."""
+
 STEPS, CYCLE_STEPS = 5000, 1500
 """Default of `n_steps`, where motions end and where they repeat."""
 
@@ -79,7 +82,7 @@ class ImitationFlowConfig:
     """Times of each demonstration in a step's reproduction error."""
     error_power: float = 3.0
     """The squared errors e of a reproduction over time count as (mean e^p)^(1/p): with p = 1 as
-    their mean, with more as the worst of them."""
+    their mean, with more, up to `MOST_ERROR_POWER`, as the worst of them."""
     timing_weight: float = 0.7
     """Weight of the squared error along the recording, beside 1 across it: to be early or late
     counts less than to be elsewhere."""
@@ -111,7 +114,8 @@ class ImitationFlowConfig:
     """"additive": K dB, the state is bounded around the attractor in distribution. "vanishing":
     noise in proportion to the distance from the attractor, the state comes to rest there."""
     n_jobs: int = 1
-    """Processes that models trained together are dealt out to, each with one thread."""
+    """Processes of one thread that models trained together, of as many recordings and dimensions,
+    are dealt out to. What trains beside a model changes its rounding, see `ImitationFlow`."""
     device: str = "auto"
     """Where training runs: "auto" takes a GPU where torch has one; or a torch device."""
 
@@ -138,12 +142,16 @@ class ImitationFlowConfig:
             raise ValueError(f"Expected the name of a device, got {self.device!r}.")
         for name in (
             "log_scale_bound", "sharpness", "learning_rate", "max_gradient_norm", "min_decay",
-            "calm_speed", "tube_width", "spline_bound", "orbit_resolution", "error_power",
+            "calm_speed", "tube_width", "spline_bound", "orbit_resolution",
         ):  # fmt: skip
             value = getattr(self, name)
             open_ = name in ("sharpness", "min_decay") and value is None
             if not open_ and not 0 < value < math.inf:
                 raise ValueError(f"Expected a finite {name} > 0, got {value}.")
+        if not 1 <= self.error_power <= MOST_ERROR_POWER:
+            raise ValueError(
+                f"Expected error_power in [1, {MOST_ERROR_POWER:g}], got {self.error_power}."
+            )
         if self.log_scale_bound > MOST_LOG_SCALE:
             raise ValueError(
                 f"Expected log_scale_bound <= {MOST_LOG_SCALE}, got {self.log_scale_bound}: the "

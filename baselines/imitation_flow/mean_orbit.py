@@ -84,9 +84,19 @@ def mean_orbit(motion: Demonstrations) -> tuple[FloatArray, FloatArray]:
 
 
 def _mean(places: NDArray[np.intp], values: FloatArray, shares: FloatArray) -> FloatArray:
-    """Return the weighted mean of values (n, k) at each of GRID places, shape (GRID, k)."""
+    """Return the weighted mean of values (n, k) at each of GRID places, shape (GRID, k).
+
+    Where recordings of about one round leave a place out it is interpolated from its neighbours.
+    """
     totals = np.bincount(places, shares, GRID)
-    columns = [np.bincount(places, shares * column, GRID) / totals for column in values.T]
+    seen, every = np.flatnonzero(totals), np.arange(GRID)
+    columns = [
+        np.interp(
+            every, seen, np.bincount(places, shares * column, GRID)[seen] / totals[seen],
+            period=GRID,
+        )
+        for column in values.T
+    ]  # fmt: skip
     return np.stack(columns, axis=1)
 
 

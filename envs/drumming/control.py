@@ -48,6 +48,9 @@ POSTURE: Final = np.array([0.0, -0.72, 0.0, -2.4, 0.0, 0.47, 0.0])
 TIP_ACCELERATION: Final = 20.0
 """Greatest acceleration of the tip that a command brings about, in m/s^2."""
 
+PROJECTIONS: Final = 8
+"""Times that a command is projected onto the borders; what is left over is slowed as a whole."""
+
 HELD_AGAINST: Final = 10.0
 """Greatest force of a head that the motors hold against, in N."""
 
@@ -97,13 +100,17 @@ class Workspace:
     @classmethod
     def slid(cls, point: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return the part of a velocity that is allowed at a point: what leads out is cut down."""
-        boxed = cls._boxed(point, velocity)
+        velocity = cls._boxed(point, velocity)
         arm = point - cls.centre
         length = float(np.sqrt(arm @ arm))
-        excess = float(arm @ boxed) / length - max(cls.radius - length, 0.0) / BRAKING_TIME
-        if excess <= 0.0:
-            return boxed
-        return cls._boxed(point, boxed - (excess / length) * arm)
+        allowed = max(cls.radius - length, 0.0) / BRAKING_TIME
+        for _ in range(PROJECTIONS):  # onto both in turn: near an edge one undoes the other
+            excess = float(arm @ velocity) / length - allowed
+            if excess <= 0.0:
+                return velocity
+            velocity = cls._boxed(point, velocity - (excess / length) * arm)
+        outward = float(arm @ velocity) / length
+        return velocity if outward <= allowed else velocity * (allowed / outward)
 
     @staticmethod
     def _boxed(point: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -99,3 +99,17 @@ def test_a_cycle_in_space_comes_back_within_a_period() -> None:
         left.append(np.sqrt(after / before).max())
     assert left[0] < 1.1 * np.exp(-4)  # the period found is not PERIOD to the last digit
     assert left[1] > 2 * left[0]
+
+
+@pytest.mark.parametrize("n_recordings", [1, 6])
+def test_recordings_of_one_round_have_an_orbit(n_recordings: int) -> None:
+    """No recording sees the last places of the round: they are interpolated."""
+    angle = 2 * np.pi * np.arange(200) / 200
+    path = np.column_stack([np.cos(angle), np.sin(angle), 0.3 * np.cos(2 * angle)])
+    motion = Demonstrations.from_arrays(
+        [(1 + 0.01 * k) * path for k in range(n_recordings)], dt=0.01, period=2.0, name="one round"
+    )
+    curve, spread = mean_orbit(motion)
+    assert np.isfinite(spread).all()
+    radius = np.hypot(curve[:, 0], curve[:, 1])
+    np.testing.assert_allclose(radius, 1 + 0.005 * (n_recordings - 1), atol=0.02)

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from iflow_gym import Demonstrations
 from iflow_gym.baselines.imitation_flow import (
     ConditionalImitationFlow,
     ImitationFlow,
     guard,
     training,
 )
+from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.guard import TrainingError
+from iflow_gym.baselines.imitation_flow.objectives import reproduction
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.datasets.letters import load_letter
 from iflow_gym.metrics import rmse
@@ -215,3 +218,52 @@ def test_the_processs_default_precision_changes_nothing(
     system, expected = short_fit(*CASES[case]), in_single_precision[case]
     for name, array in expected._parameters.items():
         np.testing.assert_array_equal(system._parameters[name], array, err_msg=name)
+
+
+def squared_error(offsets, **settings):
+    """`reproduction` of what is `offsets` (n, 2) off a straight recording along x, and its end."""
+    x = np.linspace(-10.0, 0.0, 101)
+    motion = Demonstrations.from_arrays([np.column_stack([x, 0 * x])], dt=0.01, name="line")
+    data = Recordings([Task([motion])], torch.device("cpu"))
+    draws = Draws([np.random.default_rng(0)], 100, torch.device("cpu"))
+    draws.new_step()
+    term = reproduction(data, draws, len(offsets) - 1, **settings)
+    points = next(term)
+    starts = term.send((points.states, None))
+    shown = data.at(starts.recordings, (starts.times / data.steps).round().long())
+    with pytest.raises(StopIteration) as end:
+        term.send(shown + torch.as_tensor(offsets, dtype=torch.float32).T[None])
+    return float(end.value.value)
+
+
+def test_what_is_late_counts_less_than_what_is_beside():
+    along, across = np.zeros((5, 2)), np.zeros((5, 2))
+    along[:4, 0], across[:4, 1] = 0.1, 0.1
+    assert squared_error(across, timing_weight=0.7) == pytest.approx(0.01, rel=1e-4)
+    assert squared_error(along, timing_weight=0.7) == pytest.approx(0.007, rel=1e-4)
+    assert squared_error(along, timing_weight=0.0) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_errors_count_by_their_power_mean_and_the_end_by_itself():
+    offsets = np.zeros((5, 2))
+    offsets[:, 1] = [0.1, 0.2, 0.0, 0.3, 0.5]
+    squares = offsets[:, 1] ** 2
+    for power in (1.0, 3.0):
+        mean = np.mean(squares[:4] ** power) ** (1 / power)
+        found = squared_error(offsets, power=power, end_weight=2.0)
+        assert found == pytest.approx(mean + 2 * squares[4], rel=1e-3)
+
+
+def test_powers_below_single_precision_are_refused():
+    for power in (0.5, 6.0):
+        with pytest.raises(ValueError, match="error_power"):
+            ImitationFlow(error_power=power)
+
+
+def test_processes_fit_what_one_process_fits_and_in_its_order():
+    motions = [load_lasa(shape) for shape in ("Angle", "Line", "Worm")]
+    alone = ImitationFlow(n_steps=20, **SMALL).fit_many(motions, seeds=[0, 1, 2])
+    dealt = ImitationFlow(n_steps=20, n_jobs=2, **SMALL).fit_many(motions, seeds=[0, 1, 2])
+    for one, other in zip(alone, dealt, strict=True):
+        x = [[-20.0, 5.0]]
+        np.testing.assert_allclose(other.velocity(x), one.velocity(x), rtol=1e-2)

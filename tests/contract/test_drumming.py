@@ -274,6 +274,18 @@ def test_along_the_border_a_command_slides(env):
     np.testing.assert_allclose(path[:, 2], start[2], atol=2e-3)
 
 
+def test_where_two_borders_meet_the_tip_stays_inside(env):
+    """The edge of the reach and of the near face: a command into it, for 3 s."""
+    beside = np.array([0.585 - Workspace.centre[0], 0.3])
+    height = Workspace.centre[2] + np.sqrt(Workspace.radius**2 - beside @ beside) - 0.01
+    env.reset(options={"start": np.array([0.585, 0.3, height])})
+    command = env.velocity_to_action(0.5 * np.array([-0.129, 0.542, 0.830]))
+    path = np.array([env.step(command)[0] for _ in range(300)])
+    reach = np.linalg.norm(path - Workspace.centre, axis=1)
+    assert reach.max() < Workspace.radius + 0.003
+    assert path[:, 0].min() > Workspace.low[0] - 0.003
+
+
 def test_what_slides_is_cut_by_no_more_than_leads_out():
     rng = np.random.default_rng(0)
     size = Workspace.high - Workspace.low
@@ -287,8 +299,7 @@ def test_what_slides_is_cut_by_no_more_than_leads_out():
         assert (after <= Workspace.high + 1e-9).all()
         arm = point - Workspace.centre
         length = np.linalg.norm(arm)
-        if after[0] > Workspace.low[0] + 1e-6:  # there both borders cannot always be kept
-            assert length + BRAKING_TIME * (allowed @ arm) / length <= Workspace.radius + 1e-9
+        assert length + BRAKING_TIME * (allowed @ arm) / length <= Workspace.radius + 1e-9
         if (allowed == velocity).all():
             continue
         cut += 1
