@@ -42,6 +42,7 @@ from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.guard import GuardedAdam, Restart, TrainingError
+from iflow_gym.baselines.imitation_flow.inward import Inward
 from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
 from iflow_gym.baselines.imitation_flow.mean_orbit import MeanOrbit
@@ -172,6 +173,9 @@ def _train_batch(
     orbit_weight = _resolved(config, data).orbit_weight
     held = data.cyclic and orbit_weight > 0
     orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
+    import os
+    INW = float(os.environ.get('INW', '0'))
+    inward = Inward(data, N_CALM) if held and INW else None
     for step in range(n_steps):
         draws.new_step()
         stage = _stage(config, step, data)
@@ -179,6 +183,8 @@ def _train_batch(
         if orbit is not None and stage == ORBIT:
             assert isinstance(latent, LimitCycleLatent)
             weighted.append((orbit_weight, orbit(latent)))
+        if inward is not None:
+            weighted.append((INW, inward(draws)))
         weights, terms = zip(*weighted, strict=True)
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
@@ -269,7 +275,7 @@ def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:
     """Return how many random numbers a step draws at most."""
     n, d = data.n_recordings, data.n_dims
     pairs = N_HORIZONS * max(1, config.n_pairs // N_HORIZONS)
-    return 2 * N_HORIZONS + 3 * pairs + 2 * config.n_times + d * n + (d + 1) * N_CALM
+    return 2 * N_HORIZONS + 3 * pairs + 2 * config.n_times + d * n + 2 * (d + 1) * N_CALM
 
 
 def _fit_noise(

@@ -37,6 +37,7 @@ import numpy as np
 
 from iflow_gym.demonstrations import FloatArray
 from iflow_gym.envs.drumming.engine import mujoco
+from iflow_gym.envs.drumming.keepout import KeepOut
 from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, Scene
 
 CONTROL_DT: Final = 0.01
@@ -130,6 +131,7 @@ class Controller:
 
     def __init__(self, scene: Scene, data: Any) -> None:
         self.scene, self.data = scene, data
+        self._drums = KeepOut(scene.drums)
         self._jacobian = np.zeros((6, 7))
         self._lower = scene.lower + JOINT_MARGIN
         self._upper = scene.upper - JOINT_MARGIN
@@ -154,7 +156,8 @@ class Controller:
         wanted[:, 0] = -jacobian @ resting
         wanted[3:, 0] += ORIENTATION_GAIN * self.rotation_error()
         velocity = self._eased(velocity, jacobian)
-        allowed = Workspace.slid(data.site_xpos[self.scene.tip], velocity)
+        tip = data.site_xpos[self.scene.tip]
+        allowed = Workspace.slid(tip, self._drums.slid(tip, velocity))
         wanted[:3, 1] = allowed
         task = jacobian.T @ np.linalg.solve(self._damped(jacobian), wanted)
         low, high = self.speed_limits()
