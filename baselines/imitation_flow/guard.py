@@ -13,6 +13,7 @@ views: what is done to each is then done in one operation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -30,6 +31,9 @@ MOST_RESTARTS = 5
 
 WARM_UP = 0.15
 """Share of the steps in which the learning rate rises."""
+
+BETAS = (0.9, 0.99)
+"""Adam's decays; the first is cycled."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -58,6 +62,24 @@ def restarts_of(header: Mapping[str, Any]) -> list[Restart]:
             raise ValueError(f"expected the step of a restart >= 0, got {restart.step!r}")
         if type(restart.rate) is not float or not 0 < restart.rate < 1:
             raise ValueError(f"expected the rate of a restart in (0, 1), got {restart.rate!r}")
+    return found
+
+
+def one_cycle(peak: float, n_steps: int) -> list[tuple[float, float]]:
+    """Return the rate and Adam's first decay at each step: torch's one-cycle schedule, made once.
+
+    The decay goes down while the rate goes up.
+    """
+    optimizer = torch.optim.Adam([nn.Parameter(torch.zeros(1))], lr=peak, betas=BETAS)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, peak, total_steps=n_steps + 1, pct_start=WARM_UP
+    )
+    (group,) = optimizer.param_groups
+    found = []
+    for _ in range(n_steps):
+        found.append((group["lr"], group["betas"][0]))
+        optimizer.step()
+        schedule.step()
     return found
 
 
@@ -97,16 +119,15 @@ class GuardedAdam:
         self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
         self._make_views()
         self._optimizer = torch.optim.Adam(
-            [self._flat], lr=learning_rate, betas=(0.9, 0.99), fused=True
+            [self._flat], lr=learning_rate, betas=BETAS, fused=True
         )
-        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self._optimizer, learning_rate, total_steps=n_steps + 1, pct_start=WARM_UP
-        )
+        self._cycle, self._taken = one_cycle(learning_rate, n_steps), 0
         like = self._flat.detach()[:, 0]
         self._rate, self._sum = torch.ones_like(like), torch.zeros_like(like)
         self._best, self._kept = torch.full_like(like, torch.inf), torch.full_like(like, torch.inf)
         self._first = self._last = torch.zeros_like(like)
         self._count, self._stage, self._slowed = 0, 0, False
+        self._begins = True
         self._good = [t.clone() for t in self._state()]
         self.restarts: list[list[Restart]] = [[] for _ in self._names]
         self.failures: dict[int, TrainingError] = {}
@@ -116,26 +137,32 @@ class GuardedAdam:
         """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind."""
         if stage != self._stage:
             self.look(step)
-            self._stage = stage
+            self._stage, self._begins = stage, True
             self._best.fill_(torch.inf)
-        if bool(self._best.isinf().all()):  # a stage begins: what it has to be better than
+        if self._begins:  # a stage begins: what it has to be better than
             self._first = loss.detach().clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
+            self._begins = bool(self._best.isinf().all())
         gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
         self._flat.grad = gradient = self._joined(
             [torch.zeros_like(p) if g is None else g
              for g, p in zip(gradients, self._parameters, strict=True)]
         )  # fmt: skip
-        norm = gradient.norm(dim=1)
-        finite = norm.isfinite() & ~self._failed if self.failures else norm.isfinite()
-        gradient.masked_fill_(~finite[:, None], 0.0)
-        gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm)).nan_to_num_(0.0)[:, None])
-        self._last = torch.where(finite, loss.detach(), torch.inf)
+        norm, self._last = gradient.norm(dim=1), loss.detach()
+        if self.failures or not math.isfinite(norm.sum()):
+            trains = norm.isfinite() & ~self._failed
+            gradient.masked_fill_(~trains[:, None], 0.0)
+            norm = norm.nan_to_num(0.0, 0.0)
+            self._last = torch.where(trains, self._last, torch.inf)
+        gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm))[:, None])
         self._sum += self._last
         self._count += 1
         before = self._flat.detach().clone() if self._slowed else None
+        (group,) = self._optimizer.param_groups
+        group["lr"], decay = self._cycle[self._taken]
+        group["betas"] = decay, BETAS[1]
+        self._taken += 1
         self._optimizer.step()
-        self._schedule.step()
         if before is not None:
             self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
         if self._count == WINDOW:
@@ -163,6 +190,7 @@ class GuardedAdam:
         bad &= ~self._failed
         self._best = torch.where(bad, self._best, torch.minimum(self._best, loss))
         self._kept = torch.where(bad, self._kept, loss)
+        self._begins = self._begins and bool(self._best.isinf().all())
         self._sum.zero_()
         self._count = 0
         if bool(bad.any()):

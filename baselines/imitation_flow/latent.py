@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
-from iflow_gym.baselines.imitation_flow import planar
 from iflow_gym.baselines.imitation_flow.planar import Propagate, TransitionLogProb
 
 MIN_NOISE = 1e-4
@@ -92,9 +92,8 @@ class LinearLatent(Latent):
 
     def drift(self) -> Tensor:
         """Return A, shape (m, d, d)."""
-        lower = torch.tril(self.factor)
-        eye = torch.eye(lower.shape[-1], dtype=lower.dtype, device=lower.device)
-        return self.skew - self.skew.mT - lower @ lower.mT - self.min_decay * eye
+        drift: Tensor = _Drift.apply(self.factor, self.skew, self.min_decay)
+        return drift
 
     def diffusion(self) -> Tensor:
         """Return K K^T, shape (m, d, d)."""
@@ -136,6 +135,24 @@ class LinearLatent(Latent):
             return {name: value.double().cpu().numpy() for name, value in pair.items()}
 
 
+class _Drift(torch.autograd.Function):
+    """A = -(L L^T + eps I) + S - S^T, as one node."""
+
+    @staticmethod
+    def forward(ctx: Any, factor: Tensor, skew: Tensor, min_decay: float) -> Tensor:
+        lower = torch.tril(factor)
+        ctx.save_for_backward(lower)
+        drift = skew - skew.mT - torch.bmm(lower, lower.mT)
+        drift.diagonal(dim1=-2, dim2=-1).sub_(min_decay)
+        return drift
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
+        (lower,) = ctx.saved_tensors
+        return -torch.tril(torch.bmm(g + g.mT, lower)), g - g.mT, None
+
+
 def propagator(drift: Tensor, times: Tensor) -> Tensor:
     """exp(A t) for A (m, d, d) and times (m, ...): shape (m, ..., d, d)."""
     flat, d = times.flatten(1), drift.shape[-1]
@@ -151,12 +168,15 @@ def propagator(drift: Tensor, times: Tensor) -> Tensor:
 def stationary_covariance(drift: Tensor, diffusion: Tensor) -> Tensor:
     """P with A P + P A^T + K K^T = 0, all (m, d, d), by the vectorised linear system.
 
-    In the plane by the closed form of `planar`.
+    In the plane by its solution, a sum of two positive terms (see `planar`).
     """
     d = drift.shape[-1]
-    if d == 2:
-        return planar.stationary_covariance(drift, diffusion)
     eye = torch.eye(d, dtype=drift.dtype, device=drift.device)
+    if d == 2:
+        first, cross, back, last = drift.flatten(1)[..., None, None].unbind(1)
+        trace, det = first + last, first * last - cross * back
+        other = drift - trace * eye
+        return (det * diffusion + other @ diffusion @ other.mT) / (-2 * trace * det)
     left = torch.einsum("mij,kl->mikjl", drift, eye).reshape(-1, d * d, d * d)
     right = torch.einsum("ij,mkl->mikjl", eye, drift).reshape(-1, d * d, d * d)
     solved = torch.linalg.solve(left + right, -diffusion.reshape(-1, d * d, 1))

@@ -16,6 +16,7 @@ from torch import Tensor
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings
 from iflow_gym.baselines.imitation_flow.latent import Latent
 from iflow_gym.baselines.imitation_flow.passes import Points, Starts, Term
+from iflow_gym.baselines.imitation_flow.path_error import PathError
 
 LONGEST_HORIZON = 0.6
 """Longest horizon of the likelihood, as a fraction of the recording."""
@@ -127,13 +128,9 @@ def reproduction(
     samples = _samples(data, draws, n_times)
     ends = (data.lengths - 1)[..., None]
     made, target, along = yield from _reproduced(data, starts, torch.cat([samples, ends], dim=-1))
-    error = made - target
-    squares = error.square().sum(1)
-    late = (error * along).sum(1).square() / along.square().sum(1).clamp_min(1e-12)
-    squares, late = (x.unflatten(1, (data.n_recordings, -1)) for x in (squares, late))
-    weighted = (squares - (1 - timing_weight) * late)[..., :-1].clamp_min(0.0)
-    errors = (weighted.pow(power).mean(-1) + 1e-16).pow(1 / power)
-    return errors.mean(1) + end_weight * squares[..., -1].mean(1)
+    settings = power, timing_weight, end_weight
+    error: Tensor = PathError.apply(made, target, along, data.n_recordings, *settings)
+    return error
 
 
 def tube(data: Recordings, draws: Draws, n_times: int, *, width: float) -> Term:

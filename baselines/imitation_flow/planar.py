@@ -3,23 +3,26 @@
 A step of training asks for a few hundred small numbers of it. As separate operations they cost
 autograd a hundred nodes and more time than the flow; here each closed form is one node. The
 functions are the same for NumPy, which runs on a CPU, and for torch, which runs on a GPU; `xp` is
-the library. Arrays are (m, 2, q, p) with times (m, q): m models, q horizons of p points each.
+the library. What a model has one of, an entry of A or of P, is a `Number`: a float for one model,
+(m, 1) for m of them. What it has one of at each of q times is (m, q), and states are
+(m, 2, q, p), p points a time.
 
-With k = tr A / 2, C = A - k I and s = -det C,
+With A = [[a, b], [c, d]], k = (a + d) / 2, h = (a - d) / 2, C = [[h, b], [c, -h]], s = h^2 + b c,
 
-    exp(A t) = e I + o C,    e = exp(k t) cosh(sqrt(s) t),    o = exp(k t) sinh(sqrt(s) t) / sqrt(s),
+    exp(A t) = e I + o C,    e = exp(k t) cosh(r t),    o = exp(k t) sinh(r t) / r,    r = sqrt(s),
 
 cosine and sine for s < 0. The stationary covariance P is a sum of two positive terms (Gardiner,
 "Handbook of Stochastic Methods", on the multivariate Ornstein-Uhlenbeck process),
 
-    P = (det(A) D + B D B^T) / (-2 tr(A) det(A)),    B = A - tr(A) I,    D = K K^T,
+    P = (det(A) K K^T + B K K^T B^T) / (-2 tr(A) det(A)),    B = A - tr(A) I,
 
-and that of z_t is P - F P F^T = (1 - e^2) P - e o (C P + P C^T) - o^2 C P C^T.
+and that of z_t is P - F P F^T = (1 - e^2) P - e o (M + M^T) - o^2 M C^T with M = C P.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +36,9 @@ SMALL_ROOT = 0.03
 Array = Any
 """A NumPy array or a torch tensor."""
 
+Number = Any
+"""A float, or an array (m, 1)."""
+
 
 def arrays_of(*tensors: Tensor) -> tuple[Any, list[Array]]:
     """Return the library that a node runs in, and what it takes: NumPy's views on a CPU."""
@@ -44,6 +50,26 @@ def arrays_of(*tensors: Tensor) -> tuple[Any, list[Array]]:
 def tensors_of(*arrays: Array) -> tuple[Tensor, ...]:
     """Return a node's arrays as tensors."""
     return tuple(a if isinstance(a, Tensor) else torch.from_numpy(a) for a in arrays)
+
+
+def _total(xp: Any, x: Array) -> Number:
+    """Sum over times."""
+    return float(x.sum()) if xp is np and len(x) == 1 else x.sum(-1)[:, None]
+
+
+def _numbers(xp: Any, x: Array) -> list[Number]:
+    """Return the entries of (m, i, j) in their order."""
+    if xp is np and len(x) == 1:
+        return list(x.ravel().tolist())
+    return [x[:, i, j, None] for i in range(x.shape[1]) for j in range(x.shape[2])]
+
+
+def _matrix(xp: Any, like: Array, rows: int, numbers: Sequence[Number]) -> Array:
+    """Return numbers as (m, rows, columns), in the precision of an array."""
+    if isinstance(numbers[0], float):
+        return np.array(numbers, dtype=like.dtype).reshape(1, rows, -1)
+    matrix = xp.concatenate(tuple(numbers), 1).reshape(len(numbers[0]), rows, -1)
+    return _as(like, matrix)
 
 
 # The exponential ----------------------------------------------------------------------------
@@ -104,12 +130,13 @@ class Exponential(NamedTuple):
     """exp(A t) = e I + o C, and what its gradient needs."""
 
     even: Array
-    """(m, q)."""
+    """e, (m, q)."""
     odd: Array
-    """(m, q)."""
-    centred: Array
-    """C, (m, 2, 2)."""
-    drift: Array
+    """o, (m, q)."""
+    drift: list[Number]
+    """a, b, c, d."""
+    half: Number
+    """h."""
     times: Array
     rate: Array
     square: Array
@@ -119,53 +146,60 @@ class Exponential(NamedTuple):
 
 def exponential(xp: Any, drift: Array, times: Array) -> Exponential:
     """Return exp(A t) for A (m, 2, 2) and times (m, q)."""
-    first, last = drift[:, 0, 0], drift[:, 1, 1]
-    half = (first - last) / 2
-    root = half * half + drift[:, 0, 1] * drift[:, 1, 0]
-    rate = ((first + last) / 2)[:, None] * times
-    square = root[:, None] * (times * times)
+    a, b, c, d = entries = _numbers(xp, drift)
+    half = (a - d) / 2
+    rate, square = (a + d) / 2 * times, (half * half + b * c) * (times * times)
     even, sinhc = cosh_sinh(xp, rate, square)
-    centred = 1 * drift
-    centred[:, 0, 0] = half
-    centred[:, 1, 1] = -half
-    return Exponential(even, sinhc * times, centred, drift, times, rate, square, sinhc)
+    return Exponential(even, sinhc * times, entries, half, times, rate, square, sinhc)
 
 
 def exponential_gradient(
-    xp: Any, e: Exponential, g_even: Array, g_odd: Array, g_centred: Array
-) -> Array:
-    """Return the gradient of A, (m, 2, 2), from those of e, o (m, q) and C (m, 2, 2)."""
+    xp: Any, e: Exponential, g_even: Array, g_odd: Array, g_centred: Sequence[Number]
+) -> list[Number]:
+    """Return the gradients of a, b, c, d from those of e, o (m, q) and of h, b, c in C."""
     g_rate, g_square = cosh_sinh_gradient(
         xp, (g_even, g_odd * e.times), (e.even, e.sinhc), e.rate, e.square
     )
-    g_trace = (g_rate * e.times).sum(-1) / 2
-    g_root = (g_square * e.times * e.times).sum(-1)
-    half = e.centred[:, 0, 0]
-    g_half = (g_centred[:, 0, 0] - g_centred[:, 1, 1]) / 2 + half * g_root
-    g_drift = 1 * g_centred
-    g_drift[:, 0, 0] = g_trace + g_half
-    g_drift[:, 1, 1] = g_trace - g_half
-    g_drift[:, 0, 1] += e.drift[:, 1, 0] * g_root
-    g_drift[:, 1, 0] += e.drift[:, 0, 1] * g_root
-    return g_drift
+    g_k, g_s = _total(xp, g_rate * e.times), _total(xp, g_square * (e.times * e.times))
+    (_, b, c, _), (g_h, g_b, g_c) = e.drift, g_centred
+    g_h = g_h + 2 * e.half * g_s
+    return [(g_k + g_h) / 2, g_b + c * g_s, g_c + b * g_s, (g_k - g_h) / 2]
 
 
-def apply_exponential(e: Exponential, z: Array) -> tuple[Array, Array]:
-    """Return exp(A t) z and C z, both (m, 2, q, p)."""
-    turned = (e.centred @ z.reshape(*z.shape[:2], -1)).reshape(z.shape)
-    return e.even[:, None, :, None] * z + e.odd[:, None, :, None] * turned, turned
+class Applied(NamedTuple):
+    """exp(A t) z, and what its gradient needs, in the precision of z (m, 2, q, p)."""
+
+    reached: Array
+    z: Array
+    turned: Array
+    """C z."""
+    even: Array
+    """(m, 1, q, 1)."""
+    odd: Array
+    """(m, 1, q, 1)."""
+    centred: Array
+    """C, (m, 2, 2)."""
 
 
-def apply_gradient(
-    e: Exponential, g: Array, z: Array, turned: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return the gradients of z, e, o and C from that of exp(A t) z."""
-    scaled = (e.odd[:, None, :, None] * g).reshape(*g.shape[:2], -1)
-    flat = z.reshape(*z.shape[:2], -1)
-    back = (e.centred.swapaxes(-1, -2) @ scaled).reshape(g.shape)
-    g_even, g_odd = ((g * x).sum(-1).sum(1) for x in (z, turned))
-    g_z = e.even[:, None, :, None] * g + back
-    return g_z, g_even, g_odd, scaled @ flat.swapaxes(-1, -2)
+def applied(xp: Any, e: Exponential, z: Array) -> Applied:
+    """Return exp(A t) z."""
+    even, odd = (_as(z, x)[:, None, :, None] for x in (e.even, e.odd))
+    _, b, c, _ = e.drift
+    centred = _matrix(xp, z, 2, [e.half, b, c, -e.half])
+    turned = (centred @ z.reshape(*z.shape[:2], -1)).reshape(z.shape)
+    return Applied(even * z + odd * turned, z, turned, even, odd, centred)
+
+
+def applied_gradient(
+    xp: Any, x: Applied, g: Array
+) -> tuple[Array, tuple[Array, Array, tuple[Number, ...]]]:
+    """Return the gradients of z, and of e, o (m, q) and of h, b, c in C, from exp(A t) z's."""
+    scaled = (x.odd * g).reshape(*g.shape[:2], -1)
+    back = (x.centred.swapaxes(-1, -2) @ scaled).reshape(g.shape)
+    g_even, g_odd = ((g * y).sum(-1).sum(1) for y in (x.z, x.turned))
+    corners = scaled @ x.z.reshape(*g.shape[:2], -1).swapaxes(-1, -2)
+    first, g_b, g_c, last = _numbers(xp, corners)
+    return x.even * g + back, (g_even, g_odd, (first - last, g_b, g_c))
 
 
 class Propagate(torch.autograd.Function):
@@ -176,124 +210,113 @@ class Propagate(torch.autograd.Function):
         """Return what is reached from z."""
         xp, (drift_, z_, times_) = arrays_of(drift, z, times)
         e = exponential(xp, drift_, times_)
-        reached, turned = apply_exponential(e, z_)
-        ctx.kept = xp, e, z_, turned
-        return tensors_of(reached)[0]
+        x = applied(xp, e, z_)
+        ctx.kept = xp, e, x, drift_
+        return tensors_of(x.reached)[0]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradients of A and z."""
-        xp, e, z, turned = ctx.kept
+        xp, e, x, drift = ctx.kept
         _, (g_,) = arrays_of(g)
-        g_z, *rest = apply_gradient(e, g_, z, turned)
-        return (*tensors_of(exponential_gradient(xp, e, *rest), g_z), None)
+        g_z, parts = applied_gradient(xp, x, g_)
+        g_drift = _matrix(xp, drift, 2, exponential_gradient(xp, e, *parts))
+        return (*tensors_of(g_drift, g_z), None)
 
 
 # Transition densities -----------------------------------------------------------------------
 
 
 class Covariance(NamedTuple):
-    """Of z_t, by entries (m, q), and what its gradient needs."""
+    """Of z_t, and what its gradient needs."""
 
-    first: Array
-    """(0, 0)."""
-    cross: Array
-    """(0, 1)."""
-    last: Array
-    """(1, 1)."""
-    stationary: Array
-    """P, (m, 2, 2)."""
-    mixed: Array
-    """C P, (m, 2, 2)."""
-
-
-def stationary_covariance(drift: Array, noise: Array) -> Array:
-    """Return P, (m, 2, 2), for A and K K^T, both (m, 2, 2)."""
-    trace, det, other = _invariants(drift)
-    spread = other @ noise @ other.swapaxes(-1, -2) + det[:, None, None] * noise
-    return spread / (-2 * trace * det)[:, None, None]
-
-
-def stationary_gradient(g: Array, p: Array, drift: Array, noise: Array) -> tuple[Array, Array]:
-    """Return the gradients of A and K K^T, both (m, 2, 2), from that of P; all but A symmetric."""
-    trace, det, other = _invariants(drift)
-    scale = -2 * trace * det
-    g_scale = -(g * p).sum(-1).sum(-1) / scale
-    g_spread = g / scale[:, None, None]
-    half = g_spread @ other
-    g_noise = det[:, None, None] * g_spread + other.swapaxes(-1, -2) @ half
-    g_det = (g_spread * noise).sum(-1).sum(-1) - 2 * trace * g_scale
-    g_drift = 2 * half @ noise
-    g_trace = -2 * det * g_scale - g_drift[:, 0, 0] - g_drift[:, 1, 1]
-    g_drift[:, 0, 0] += g_trace + g_det * drift[:, 1, 1]
-    g_drift[:, 1, 1] += g_trace + g_det * drift[:, 0, 0]
-    g_drift[:, 0, 1] -= g_det * drift[:, 1, 0]
-    g_drift[:, 1, 0] -= g_det * drift[:, 0, 1]
-    return g_drift, g_noise
-
-
-def _invariants(drift: Array) -> tuple[Array, Array, Array]:
-    """Return tr A, det A (m,) and A - tr(A) I."""
-    first, last = drift[:, 0, 0], drift[:, 1, 1]
-    other = 1 * drift
-    other[:, 0, 0] = -last
-    other[:, 1, 1] = -first
-    return first + last, first * last - drift[:, 0, 1] * drift[:, 1, 0], other
+    entries: Array
+    """(m, 3, q): (0, 0), (0, 1) and (1, 1), the product of the next two."""
+    parts: Array
+    """(m, 3, 3): those entries of P, of -(M + M^T) and of -M C^T."""
+    powers: Array
+    """(m, 3, q): 1 - e^2, e o, o^2."""
+    stationary: tuple[Number, Number, Number]
+    mixed: tuple[Number, Number, Number, Number]
+    """M."""
+    noise: tuple[Number, Number]
+    """The diagonal of K K^T."""
 
 
 def covariance(xp: Any, e: Exponential, noise: Array) -> Covariance:
     """Return the covariance of z_t | z_0; over short horizons at least its own rounding."""
-    p = stationary_covariance(e.drift, noise)
-    mixed = e.centred @ p
-    one, two, three = _powers(e)
-    both, twice = mixed + mixed.swapaxes(-1, -2), mixed @ e.centred.swapaxes(-1, -2)
-    floor = 8 * np.finfo(np.float64).eps * xp.maximum(p[:, 0, 0], p[:, 1, 1])
-
-    def entry(i: int, j: int) -> Array:
-        return one * p[:, i, j, None] - two * both[:, i, j, None] - three * twice[:, i, j, None]
-
-    return Covariance(
-        entry(0, 0) + floor[:, None], entry(0, 1), entry(1, 1) + floor[:, None], p, mixed
-    )
+    n1, _, _, n2 = _numbers(xp, noise)
+    (a, b, c, d), h = e.drift, e.half
+    det = a * d - b * c
+    scale = -2 * (a + d) * det
+    p00 = (det * n1 + d * d * n1 + b * b * n2) / scale
+    p01 = -(c * d * n1 + a * b * n2) / scale
+    p11 = (det * n2 + c * c * n1 + a * a * n2) / scale
+    m00, m01 = h * p00 + b * p01, h * p01 + b * p11
+    m10, m11 = c * p00 - h * p01, c * p01 - h * p11
+    parts = _matrix(xp, e.even, 3, [
+        p00, -2 * m00, -(m00 * h + m01 * b),
+        p01, -(m01 + m10), -(m00 * c - m01 * h),
+        p11, -2 * m11, -(m10 * c - m11 * h),
+    ])  # fmt: skip
+    powers = xp.stack([1 - e.even * e.even, e.even * e.odd, e.odd * e.odd], 1)
+    entries = parts @ powers
+    floor = 8 * np.finfo(np.float64).eps * xp.maximum(parts[:, 0, :1], parts[:, 2, :1])
+    entries[:, 0] += floor
+    entries[:, 2] += floor
+    return Covariance(entries, parts, powers, (p00, p01, p11), (m00, m01, m10, m11), (n1, n2))
 
 
 def covariance_gradient(
-    xp: Any, e: Exponential, c: Covariance, noise: Array, g: tuple[Array, Array, Array]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the gradients of A and K K^T through P, and of e, o and C, from those of entries."""
-    first, cross, last = g
-    p, turn = c.stationary, e.centred.swapaxes(-1, -2)
-    both, twice = c.mixed + c.mixed.swapaxes(-1, -2), c.mixed @ turn
+    xp: Any, e: Exponential, s: Covariance, g: Array
+) -> tuple[list[Number], list[Number], tuple[Array, Array, tuple[Number, ...]]]:
+    """Take the gradient of the entries, (m, 3, q), back.
 
-    def onto(x: Array) -> Array:
-        """<g, x> at each horizon, (m, q)."""
-        a, b, d = (x[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
-        return first * a + cross * b + last * d
-
-    def summed(power: Array) -> Array:
-        """Sum over horizons of g times a power, a symmetric matrix (m, 2, 2)."""
-        a, b, d = ((x * power).sum(-1) for x in (first, cross / 2, last))
-        return xp.stack([a, b, b, d], -1).reshape(-1, 2, 2)
-
-    none, one, two = (summed(power) for power in _powers(e))
-    g_p = none - turn @ one - one @ e.centred - turn @ two @ e.centred
-    g_centred = -2 * (one @ p) - 2 * (two @ c.mixed)
-    on_both = onto(both)
-    g_even = -2 * e.even * onto(p) - e.odd * on_both
-    g_odd = -e.even * on_both - 2 * e.odd * onto(twice)
-    return (*stationary_gradient(g_p, p, e.drift, noise), g_even, g_odd, g_centred)
-
-
-def _powers(e: Exponential) -> tuple[Array, Array, Array]:
-    return 1 - e.even * e.even, e.even * e.odd, e.odd * e.odd
+    Returns those of a, b, c, d through P, of K K^T's diagonal, and of e, o and of h, b, c in C.
+    """
+    g_powers = s.parts.swapaxes(-1, -2) @ g
+    g_even = e.odd * g_powers[:, 1] - 2 * e.even * g_powers[:, 0]
+    g_odd = e.even * g_powers[:, 1] + 2 * e.odd * g_powers[:, 2]
+    g00, t00, v00, g01, t01, v01, g11, t11, v11 = _numbers(xp, g @ s.powers.swapaxes(-1, -2))
+    (a, b, c, d), h, (n1, n2) = e.drift, e.half, s.noise
+    (p00, p01, p11), (m00, m01, m10, m11) = s.stationary, s.mixed
+    # C, by -M C^T and by M = C P:
+    g_m00 = -(v00 * h + v01 * c + 2 * t00)
+    g_m01 = -(v00 * b - v01 * h + t01)
+    g_m10 = -(v11 * c + t01)
+    g_m11 = v11 * h - 2 * t11
+    g_h = -(v00 * m00 - v01 * m01 - v11 * m11)
+    g_h = g_h + g_m00 * p00 + (g_m01 - g_m10) * p01 - g_m11 * p11
+    g_b = g_m00 * p01 + g_m01 * p11 - v00 * m01
+    g_c = g_m10 * p00 + g_m11 * p01 - v01 * m00 - v11 * m10
+    # P, whose numerator has the gradient q / scale:
+    det = a * d - b * c
+    scale = -2 * (a + d) * det
+    q00 = (g00 + g_m00 * h + g_m10 * c) / scale
+    q01 = (g01 + g_m00 * b + (g_m01 - g_m10) * h + g_m11 * c) / scale
+    q11 = (g11 + g_m01 * b - g_m11 * h) / scale
+    g_scale = -(q00 * p00 + q01 * p01 + q11 * p11)
+    g_det = q00 * n1 + q11 * n2 - 2 * (a + d) * g_scale
+    g_trace = -2 * det * g_scale
+    g_drift = [
+        2 * q11 * a * n2 - q01 * b * n2 + g_trace + g_det * d,
+        2 * q00 * b * n2 - q01 * a * n2 - g_det * c,
+        2 * q11 * c * n1 - q01 * d * n1 - g_det * b,
+        2 * q00 * d * n1 - q01 * c * n1 + g_trace + g_det * a,
+    ]
+    g_noise = [
+        q00 * (det + d * d) - q01 * c * d + q11 * c * c,
+        q00 * b * b - q01 * a * b + q11 * (det + a * a),
+    ]
+    return g_drift, g_noise, (g_even, g_odd, (g_h, g_b, g_c))
 
 
 class TransitionLogProb(torch.autograd.Function):
     """log N(z1 | F z0, P - F P F^T), (m, q, p), as one node.
 
-    Takes A and K K^T (m, 2, 2), z0, z1 (m, 2, q, p) and times (m, q). The
-    covariance is computed in float64: it is a small difference of large numbers.
+    Takes A and a diagonal K K^T (m, 2, 2), z0, z1 (m, 2, q, p) and times (m, q). The covariance is
+    computed in float64: it is a small difference of large numbers.
     """
 
     @staticmethod
@@ -304,52 +327,59 @@ class TransitionLogProb(torch.autograd.Function):
         precise = (drift.double(), noise.double(), times.double())
         xp, (drift_, noise_, times_, before, after) = arrays_of(*precise, z0, z1)
         e = exponential(xp, drift_, times_)
-        c = covariance(xp, e, noise_)
+        s = covariance(xp, e, noise_)
+        x = applied(xp, e, before)
         # The Cholesky factor's inverse W: the squares cannot become negative by rounding.
-        slope = c.cross / c.first
-        rest = c.last - c.cross * slope
-        whiten = 1 / xp.sqrt(c.first), slope, 1 / xp.sqrt(rest)
-        constant = xp.log(c.first * rest) / 2 + math.log(2 * math.pi)
-        e_ = _like(before, e)
-        reached, turned = apply_exponential(e_, before)
-        first, along, last, shift = (_as(before, v)[:, :, None] for v in (*whiten, constant))
-        residual = after - reached
-        x, y = residual[:, 0] * first, (residual[:, 1] - along * residual[:, 0]) * last
-        u = residual  # becomes S^-1 r = W^T W r
-        u[:, 1] = last * y
-        u[:, 0] = first * x - along * u[:, 1]
-        ctx.kept = xp, e, e_, c, noise_, before, turned, whiten, u
-        ctx.precision = drift.dtype, noise.dtype
-        return tensors_of((x * x + y * y) * -0.5 - shift)[0]
+        slope = s.entries[:, 1] / s.entries[:, 0]
+        rest = s.entries[:, 2] - s.entries[:, 1] * slope
+        whiten = xp.stack([1 / xp.sqrt(s.entries[:, 0]), slope, 1 / xp.sqrt(rest)], 1)
+        shift = xp.log(s.entries[:, 0] * rest) / 2 + math.log(2 * math.pi)
+        own, along, other = (_as(before, whiten)[:, i, :, None] for i in range(3))
+        u = after - x.reached
+        first = u[:, 0] * own
+        second = (u[:, 1] - along * u[:, 0]) * other
+        u[:, 1] = other * second
+        u[:, 0] = own * first - along * u[:, 1]  # now the inverse covariance times the residual
+        ctx.kept = xp, e, s, x, whiten, u
+        ctx.like = drift.detach()[:0], noise.detach()[:0]
+        shift = _as(before, shift)[:, :, None]
+        return tensors_of((first * first + second * second) * -0.5 - shift)[0]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradients of A, K K^T, z0 and z1."""
-        xp, e, e_, c, noise, z0, turned, (first, slope, last), u = ctx.kept
-        _, (g_,) = arrays_of(g)
+        xp, e, s, x, whiten, u = ctx.kept
+        _, (g_, drift, noise) = arrays_of(g, *ctx.like)
         g_mean = g_[:, None] * u
-        g_z0, *rest = apply_gradient(e_, g_mean, z0, turned)
-        total = _as(e.even, g_.sum(-1)) / 2
-        squares = (
-            _as(e.even, x.sum(-1)) / 2
-            for x in (g_mean[:, 0] * u[:, 0], g_mean[:, 0] * u[:, 1], g_mean[:, 1] * u[:, 1])
+        g_z0, by_mean = applied_gradient(xp, x, g_mean)
+        # By the entries: (u u^T - inverse) / 2, summed over the points; (0, 1) stands for two.
+        own, along, other = (whiten[:, i] for i in range(3))
+        precision = other * other
+        inverse = xp.stack(
+            [own * own + precision * along * along, -2 * precision * along, precision], 1
         )
-        precision = last * last
-        inverse = first * first + precision * slope * slope, -precision * slope, precision
-        own, cross, other = (s - total * i for s, i in zip(squares, inverse, strict=True))
-        g_drift, g_noise, *parts = covariance_gradient(xp, e, c, noise, (own, 2 * cross, other))
-        parts = [_as(e.even, a) + b for a, b in zip(rest, parts, strict=True)]
-        g_drift = g_drift + exponential_gradient(xp, e, *parts)
-        made = tensors_of(g_drift, g_noise, g_z0, -g_mean)
-        return made[0].to(ctx.precision[0]), made[1].to(ctx.precision[1]), *made[2:], None
+        crosses = xp.stack(
+            [(g_mean[:, i] * u[:, j]).sum(-1) for i, j in ((0, 0), (0, 1), (1, 1))], 1
+        )
+        g_entries = _as(e.even, crosses) / 2
+        g_entries[:, 1] *= 2
+        g_entries -= _as(e.even, g_.sum(-1))[:, None] * inverse / 2
+        through, g_noise, (g_even, g_odd, g_centred) = covariance_gradient(xp, e, s, g_entries)
+        mean_even, mean_odd, mean_centred = by_mean
+        parts = exponential_gradient(
+            xp,
+            e,
+            g_even + _as(e.even, mean_even),
+            g_odd + _as(e.even, mean_odd),
+            [p + q for p, q in zip(g_centred, mean_centred, strict=True)],
+        )
+        g_drift = _matrix(xp, drift, 2, [p + q for p, q in zip(parts, through, strict=True)])
+        none = 0 * g_noise[0]
+        g_noise_ = _matrix(xp, noise, 2, [g_noise[0], none, none, g_noise[1]])
+        return (*tensors_of(g_drift, g_noise_, g_z0, -g_mean), None)
 
 
 def _as(like: Array, x: Array) -> Array:
     """Return x in the precision of another array."""
     return x.to(like.dtype) if isinstance(x, Tensor) else x.astype(like.dtype, copy=False)
-
-
-def _like(z: Array, e: Exponential) -> Exponential:
-    """Return e, o and C in the precision of states."""
-    return e._replace(even=_as(z, e.even), odd=_as(z, e.odd), centred=_as(z, e.centred))
