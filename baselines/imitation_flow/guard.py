@@ -114,13 +114,11 @@ class GuardedAdam:
         learning_rate: float,
         max_norm: float,
     ) -> None:
-        self._names, self._max_norm = list(names), max_norm
+        self._names, self._max_norm, self._peak = list(names), max_norm, learning_rate
         self._parameters, self._axes = zip(*parameters, strict=True)
         self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
         self._make_views()
-        self._optimizer = torch.optim.Adam(
-            [self._flat], lr=learning_rate, betas=BETAS, fused=True
-        )
+        self._optimizer = torch.optim.Adam([self._flat], lr=learning_rate, betas=BETAS, fused=True)
         self._cycle, self._taken = one_cycle(learning_rate, n_steps), 0
         like = self._flat.detach()[:, 0]
         self._rate, self._sum = torch.ones_like(like), torch.zeros_like(like)
@@ -135,10 +133,7 @@ class GuardedAdam:
 
     def step(self, step: int, stage: int, loss: Tensor) -> None:
         """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind."""
-        if stage != self._stage:
-            self.look(step)
-            self._stage, self._begins = stage, True
-            self._best.fill_(torch.inf)
+        self._stage_is(step, stage)
         if self._begins:  # a stage begins: what it has to be better than
             self._first = loss.detach().clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
@@ -167,6 +162,13 @@ class GuardedAdam:
             self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
         if self._count == WINDOW:
             self.look(step)
+
+    def resume(self, step: int, stage: int, models: Tensor, n_steps: int, share: float) -> None:
+        """Go on for n_steps in a new stage, with a share of the peak rate; other models rest."""
+        self._stage_is(step, stage)
+        self._cycle, self._taken = one_cycle(share * self._peak, n_steps), 0
+        self._rate = torch.where(models & ~self._failed, self._rate, 0.0)
+        self._slowed = True
 
     def finish(self, step: int) -> None:
         """Look once more; a stage that ends worse than it began is a failure."""
@@ -218,6 +220,13 @@ class GuardedAdam:
             f"ImitationFlow did not converge on {self._names[model]!r}: {why}. Lower learning_rate "
             "or the weights."
         )
+
+    def _stage_is(self, step: int, stage: int) -> None:
+        """Begin a stage, if it is another one."""
+        if stage != self._stage:
+            self.look(step)
+            self._stage, self._begins = stage, True
+            self._best.fill_(torch.inf)
 
     def _state(self) -> list[Tensor]:
         """Return the parameters and Adam's moments, zero before the first step."""

@@ -38,7 +38,7 @@ from iflow_gym.baselines.imitation_flow.noise import (
 )
 from iflow_gym.baselines.imitation_flow.realtime import MeanDynamics, RealTimeStepper
 from iflow_gym.baselines.imitation_flow.stochastic import StochasticSystem
-from iflow_gym.baselines.imitation_flow.training import Trained, train, train_one
+from iflow_gym.baselines.imitation_flow.training import Calmness, Trained, train, train_one
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.model_files import model_file_errors, read_model_file, write_model_file
 from iflow_gym.partial_fits import PartialFitError
@@ -162,6 +162,7 @@ class ImitationFlow(DynamicalSystem):
             "time": np.array([frame.time]),
         }
         self.restarts_: list[Restart] = trained.restarts
+        self.calm_: Calmness | None = trained.calm
         if self.config.noise == "vanishing":
             arrays["kappa"] = np.ones(1)
         self._adopt(arrays, task.origins[0], cyclic=task.cyclic)

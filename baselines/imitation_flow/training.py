@@ -30,6 +30,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,6 +38,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from torch import Tensor
 
+from iflow_gym.baselines.imitation_flow.calm import LOUD, Calm, Sampling
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
@@ -46,7 +48,6 @@ from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, Lin
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
 from iflow_gym.baselines.imitation_flow.mean_orbit import MeanOrbit
 from iflow_gym.baselines.imitation_flow.objectives import (
-    Calm,
     backward_likelihood,
     forward_likelihood,
     pairs_of,
@@ -63,23 +64,42 @@ SQUARED_ERROR_WEIGHT = 300.0
 N_HORIZONS = 14
 """Sampling times in a step's likelihood."""
 
-TURNS = 2
+TURNS = 4
 """The likelihood and the tube take their turns beside the reproduction, one each in so many steps,
 with so many times the weight: that trains as well, in less time."""
 
-N_CALM = 32
-"""States in a step's calm penalty."""
+CALM_ENDS, CALM_CYCLES = Sampling(n_points=64, step=0.001), Sampling(n_points=32, step=0.005)
+"""What the calm penalty looks at, where motions end and where they repeat."""
+
+N_WATCHES = 40
+"""Sweeps for fast places in the training of motions that end."""
+
+CALM_ROUNDS, CALM_SHARE, CALM_RATE = 6, 0.05, 0.1
+"""A motion that ends and is loud at the end is trained on in so many rounds at most, each a share
+of the steps, with a share of the rate."""
+
+N_SWEEPS = 4
+"""Lattices that say whether a model is loud at the end."""
 
 ORBIT_FRACTION = 0.3
 """Share of a cycle's steps that maximise the likelihood alone before its orbit counts."""
 
-LIKELIHOOD, WHOLE, ORBIT = 0, 1, 2
+LIKELIHOOD, WHOLE, ORBIT, CALMING = 0, 1, 2, 3
 """Stages: losses are of one kind within each."""
 
 NOISE_STEPS = 100
 NOISE_HORIZONS = 100
 NOISE_PAIRS = 20
 NOISE_RATE = 0.1
+
+
+class Calmness(NamedTuple):
+    """How calm a trained model is, and what it took."""
+
+    peak: float
+    """Fastest speed that was found in twice the recordings' box, in the recordings' peak speed."""
+    rounds: int
+    """Rounds of training that were added, since it was loud at the end."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +111,8 @@ class Trained:
     place: int
     restarts: list[Restart]
     """How often training diverged and was taken back."""
+    calm: Calmness | None = None
+    """How calm it is, where that was looked at."""
 
     def arrays(self, context: Tensor | None = None) -> dict[str, NDArray[np.float64]]:
         """Return the numbers of the flow, a context (k,) folded in, and of the latent system."""
@@ -168,13 +190,18 @@ def _train_batch(
         learning_rate=config.learning_rate,
         max_norm=config.max_gradient_norm,
     )
-    calm = Calm(data, N_CALM, config.calm_speed)
-    orbit_weight = _resolved(config, data).orbit_weight
+    resolved = _resolved(config, data)
+    calm = None
+    if resolved.calm_weight and config.objective == "reproduction":
+        sampling = CALM_CYCLES if data.cyclic else CALM_ENDS
+        calm = Calm(data, sampling, config.calm_speed)
+    orbit_weight = resolved.orbit_weight
     held = data.cyclic and orbit_weight > 0
     orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
-    for step in range(n_steps):
+
+    def take(step: int, stage: int) -> None:
+        """Take one step of a stage."""
         draws.new_step()
-        stage = _stage(config, step, data)
         weighted = _terms(config, step, latent, data, draws, calm)
         if orbit is not None and stage == ORBIT:
             assert isinstance(latent, LimitCycleLatent)
@@ -183,16 +210,43 @@ def _train_batch(
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
         adam.step(step, stage, loss)
+
+    watched = None if data.cyclic else calm
+    every = max(1, n_steps // N_WATCHES)
+    for step in range(n_steps):
+        if watched is not None and step and step % every == 0:
+            watched.watch(flow, latent)
+        take(step, _stage(config, step, data))
         if len(adam.failures) == len(tasks):
             return [adam.failures[m] for m in range(len(tasks))]
+    calmness: list[Calmness | None] = [None] * len(tasks)
+    if watched is not None:
+        rounds, peak = [0] * len(tasks), _peak(watched, flow, latent)
+        n_more = math.ceil(CALM_SHARE * n_steps)
+        for i in range(CALM_ROUNDS):
+            loud = peak > LOUD
+            if not bool(loud.any()):
+                break
+            adam.resume(n_steps, CALMING + i, loud, n_more, CALM_RATE)
+            for step in range(n_steps, n_steps + n_more):
+                take(step, CALMING + i)
+            rounds = [k + int(more) for k, more in zip(rounds, loud.tolist(), strict=True)]
+            peak = _peak(watched, flow, latent)
+        calmness = [Calmness(*pair) for pair in zip(peak.tolist(), rounds, strict=True)]
     adam.finish(n_steps)
     if _stage(config, n_steps, data) == WHOLE:
         _fit_noise(flow, latent, data, rngs)
     flow, latent = flow.to("cpu"), latent.to("cpu")
     return [
-        adam.failures.get(m) or Trained(flow, latent, m, adam.restarts[m])
+        adam.failures.get(m) or Trained(flow, latent, m, adam.restarts[m], calmness[m])
         for m in range(len(tasks))
     ]
+
+
+def _peak(calm: Calm, flow: Flow, latent: Latent) -> Tensor:
+    """Return each model's fastest speed over several lattices, (m,), and weigh it."""
+    peaks = [calm.sweep(flow, latent) for _ in range(N_SWEEPS - 1)]
+    return torch.stack([*peaks, calm.watch(flow, latent)]).amax(0)
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
@@ -216,7 +270,7 @@ def _terms(
     latent: Latent,
     data: Recordings,
     draws: Draws,
-    calm: Calm,
+    calm: Calm | None,
 ) -> list[tuple[float, Term]]:
     """Return the weighted terms of a step."""
     q, p = N_HORIZONS, max(1, config.n_pairs // N_HORIZONS)
@@ -244,8 +298,8 @@ def _terms(
         if config.tube_weight and turn == TURNS // 2:
             beside = tube(data, draws, max(n // 2, 1), width=config.tube_width)
             terms.append((TURNS * weight * config.tube_weight, beside))
-    if calm_weight := _resolved(config, data).calm_weight:
-        terms.append((calm_weight, calm(draws)))
+    if calm is not None:
+        terms.append((_resolved(config, data).calm_weight, calm(draws)))
     return terms
 
 
@@ -269,7 +323,13 @@ def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:
     """Return how many random numbers a step draws at most."""
     n, d = data.n_recordings, data.n_dims
     pairs = N_HORIZONS * max(1, config.n_pairs // N_HORIZONS)
-    return 2 * N_HORIZONS + 3 * pairs + 2 * config.n_times + d * n + (d + 1) * N_CALM
+    return (
+        2 * N_HORIZONS
+        + 3 * pairs
+        + 2 * config.n_times
+        + d * n
+        + (d + 1) * (CALM_CYCLES if data.cyclic else CALM_ENDS).n_points
+    )
 
 
 def _fit_noise(

@@ -1,0 +1,144 @@
+"""The calm: a penalty on speed away from the recordings, which grows until it is heeded.
+
+Fast places are small, and a step of training looks at a few states. So half of the states of a step
+are the fastest of the step before; and from time to time a lattice over twice the recordings' box
+is swept: a model that is faster anywhere than `LOUD` times the recordings' peak has the weight of
+its penalty doubled, and goes on from the fastest states that were found. A model that is not has it
+halved again, down to what it was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from iflow_gym.baselines.imitation_flow.data import Draws, Recordings
+from iflow_gym.baselines.imitation_flow.flow import Flow
+from iflow_gym.baselines.imitation_flow.latent import Latent
+from iflow_gym.baselines.imitation_flow.passes import Points, Starts, Term, evaluate
+
+REACH = 2.0
+"""Speeds are looked at in so many times the recordings' box."""
+
+LOUD = 4.0
+"""Speed in the recordings' peak from which the weight is doubled."""
+
+LATTICE = 1600
+"""States of a sweep, about."""
+
+MOST_WEIGHT = 256.0
+"""The weight grows by this factor at most."""
+
+
+class Sampling(NamedTuple):
+    """How closely speeds are looked at."""
+
+    n_points: int
+    """States in a step's penalty."""
+    step: float
+    """The speed is the mean over this fraction of the duration."""
+
+
+class Calm:
+    """Squared log of speed over `limit` times the recordings' peak, in twice their box.
+
+    Parameters
+    ----------
+    data : Recordings
+    sampling : Sampling
+    limit : float
+        Speeds up to this multiple of the peak cost nothing.
+
+    Attributes
+    ----------
+    weight : Tensor, shape (m,)
+        What each model's penalty is multiplied by; 1 until a sweep finds a fast place.
+    """
+
+    def __init__(self, data: Recordings, sampling: Sampling, limit: float) -> None:
+        self._data, self._n_new, self._limit = data, sampling.n_points // 2, limit
+        self._step = sampling.step
+        self._kept: Points | None = None
+        self._n_sweeps = 0
+        self._raised = False
+        self.weight = torch.ones_like(data.peak_speed[:, 0])
+
+    def __call__(self, draws: Draws) -> Term:
+        """Return the term of one step."""
+        data = self._data
+        uniform = draws.uniform(data.n_dims, self._n_new)
+        among = (draws.uniform(self._n_new) * data.n_recordings).long()
+        points = Points(data.centre + REACH * data.half * (2 * uniform - 1), among)
+        if self._kept is not None:
+            points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
+        excess = yield from self._excess(points)
+        self._kept = _fastest(points, excess.detach(), self._n_new)
+        penalty = torch.relu(excess).square().mean(1)
+        return self.weight * penalty if self._raised else penalty
+
+    def sweep(self, flow: Flow, latent: Latent) -> Tensor:
+        """Return each model's fastest speed over a lattice in the recordings' peak, (m,).
+
+        No two sweeps have the same lattice. The next step looks at the fastest states.
+        """
+        points = self._lattice()
+        with torch.no_grad():
+            (excess,) = evaluate(flow, latent, self._data, [self._excess(points)])
+        known, speeds = self._kept, _fastest(points, excess, self._n_new)
+        # Half of what the next step looks at again is from here, and half from the step before.
+        half = self._n_new // 2
+        self._kept = speeds if known is None else Points(
+            *(torch.cat([a[..., : self._n_new - half], b[..., :half]], -1)
+              for a, b in zip(known, speeds, strict=True))
+        )  # fmt: skip
+        return self._limit * torch.exp(excess.amax(1))
+
+    def watch(self, flow: Flow, latent: Latent) -> Tensor:
+        """Sweep, double the weight of models that are loud, and halve that of others."""
+        loudness = self.sweep(flow, latent)
+        changed = self.weight * torch.where(loudness > LOUD, 2.0, 0.5)
+        self.weight = changed.clamp(1.0, MOST_WEIGHT)
+        self._raised = bool((self.weight > 1).any())
+        return loudness
+
+    def _excess(self, points: Points) -> Generator[Points | Starts, Any, Tensor]:
+        """Ask for the logarithm of speed over `limit` times the peak at points, (m, n)."""
+        data = self._data
+        z, _ = yield points
+        y, among = points
+        moved = yield Starts(z, z.new_full(among.shape, self._step), among)
+        unit = self._step * self._limit * data.peak_speed
+        speed = (torch.bmm(data.frame, moved - y) / unit[..., None]).square().sum(1)
+        return torch.log(speed.add(1e-12)) / 2
+
+    def _lattice(self) -> Points:
+        """Return a lattice over twice the box, shifted by an additive recurrence."""
+        data, d = self._data, self._data.n_dims
+        n = max(2, round(LATTICE ** (1 / d)))
+        self._n_sweeps += 1
+        # Roberts' R sequence: powers of the root of x^(d + 1) = x + 1.
+        root = 2.0
+        for _ in range(50):
+            root = (1 + root) ** (1 / (d + 1))
+        axes = [
+            ((torch.arange(n) + math.fmod(self._n_sweeps * root ** -(i + 1), 1.0)) / n * 2 - 1)
+            for i in range(d)
+        ]
+        unit = torch.cartesian_prod(*axes).T.to(data.centre)  # (d, n^d)
+        states = data.centre + REACH * data.half * unit
+        among = torch.arange(unit.shape[1], device=data.device) % data.n_recordings
+        return Points(states, among.expand(data.n_models, -1))
+
+
+def _fastest(points: Points, excess: Tensor, n: int) -> Points:
+    """Return the n points of each model with the largest excess (m, q)."""
+    y, among = points
+    fastest = excess.topk(n, dim=1).indices
+    return Points(
+        torch.gather(y, 2, fastest[:, None].expand(-1, y.shape[1], -1)),
+        torch.gather(among, 1, fastest),
+    )
