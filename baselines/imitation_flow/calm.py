@@ -30,7 +30,7 @@ LOUD = 4.0
 LATTICE = 1600
 """States of a sweep, about."""
 
-MOST_WEIGHT = 256.0
+MOST_WEIGHT = 64.0
 """The weight grows by this factor at most."""
 
 
@@ -56,7 +56,9 @@ class Calm:
     Attributes
     ----------
     weight : Tensor, shape (m,)
-        What each model's penalty is multiplied by; 1 until a sweep finds a fast place.
+        What each model's penalty is to be multiplied by; 1 until a sweep finds a fast place.
+    raised : bool
+        Whether that is more than 1 for any model.
     """
 
     def __init__(self, data: Recordings, sampling: Sampling, limit: float) -> None:
@@ -64,7 +66,7 @@ class Calm:
         self._step = sampling.step
         self._kept: Points | None = None
         self._n_sweeps = 0
-        self._raised = False
+        self.raised = False
         self.weight = torch.ones_like(data.peak_speed[:, 0])
 
     def __call__(self, draws: Draws) -> Term:
@@ -77,8 +79,7 @@ class Calm:
             points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
         excess = yield from self._excess(points)
         self._kept = _fastest(points, excess.detach(), self._n_new)
-        penalty = torch.relu(excess).square().mean(1)
-        return self.weight * penalty if self._raised else penalty
+        return torch.relu(excess).square().mean(1)
 
     def sweep(self, flow: Flow, latent: Latent) -> Tensor:
         """Return each model's fastest speed over a lattice in the recordings' peak, (m,).
@@ -100,9 +101,9 @@ class Calm:
     def watch(self, flow: Flow, latent: Latent) -> Tensor:
         """Sweep, double the weight of models that are loud, and halve that of others."""
         loudness = self.sweep(flow, latent)
-        changed = self.weight * torch.where(loudness > LOUD, 2.0, 0.5)
+        changed = torch.where(loudness > LOUD, 2 * self.weight, self.weight / 2)
         self.weight = changed.clamp(1.0, MOST_WEIGHT)
-        self._raised = bool((self.weight > 1).any())
+        self.raised = bool((self.weight > 1).any())
         return loudness
 
     def _excess(self, points: Points) -> Generator[Points | Starts, Any, Tensor]:
@@ -124,10 +125,9 @@ class Calm:
         root = 2.0
         for _ in range(50):
             root = (1 + root) ** (1 / (d + 1))
-        axes = [
-            ((torch.arange(n) + math.fmod(self._n_sweeps * root ** -(i + 1), 1.0)) / n * 2 - 1)
-            for i in range(d)
-        ]
+        places = torch.arange(n, dtype=torch.float32)  # whatever the process's default is
+        shifts = [math.fmod(self._n_sweeps / root ** (i + 1), 1.0) for i in range(d)]
+        axes = [2 * (places + shift) / n - 1 for shift in shifts]
         unit = torch.cartesian_prod(*axes).T.to(data.centre)  # (d, n^d)
         states = data.centre + REACH * data.half * unit
         among = torch.arange(unit.shape[1], device=data.device) % data.n_recordings

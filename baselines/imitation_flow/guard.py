@@ -103,6 +103,8 @@ class GuardedAdam:
     restarts : list of m lists of Restart
     failures : dict of int to TrainingError
         Models that do not train on, and why.
+    failed : Tensor of bool, shape (m,)
+        Which these are.
     """
 
     def __init__(
@@ -129,13 +131,17 @@ class GuardedAdam:
         self._good = [t.clone() for t in self._state()]
         self.restarts: list[list[Restart]] = [[] for _ in self._names]
         self.failures: dict[int, TrainingError] = {}
-        self._failed = torch.zeros_like(like, dtype=torch.bool)
+        self.failed = torch.zeros_like(like, dtype=torch.bool)
 
-    def step(self, step: int, stage: int, loss: Tensor) -> None:
-        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind."""
+    def step(self, step: int, stage: int, loss: Tensor, judged: Tensor | None = None) -> None:
+        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind.
+
+        Where the loss has weights that change within a stage, what is judged is one without.
+        """
+        judged = loss.detach() if judged is None else judged.detach()
         self._stage_is(step, stage)
         if self._begins:  # a stage begins: what it has to be better than
-            self._first = loss.detach().clone()
+            self._first = judged.clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
             self._begins = bool(self._best.isinf().all())
         gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
@@ -143,9 +149,9 @@ class GuardedAdam:
             [torch.zeros_like(p) if g is None else g
              for g, p in zip(gradients, self._parameters, strict=True)]
         )  # fmt: skip
-        norm, self._last = gradient.norm(dim=1), loss.detach()
+        norm, self._last = gradient.norm(dim=1), judged
         if self.failures or not math.isfinite(norm.sum()):
-            trains = norm.isfinite() & ~self._failed
+            trains = norm.isfinite() & ~self.failed
             gradient.masked_fill_(~trains[:, None], 0.0)
             norm = norm.nan_to_num(0.0, 0.0)
             self._last = torch.where(trains, self._last, torch.inf)
@@ -167,14 +173,14 @@ class GuardedAdam:
         """Go on for n_steps in a new stage, with a share of the peak rate; other models rest."""
         self._stage_is(step, stage)
         self._cycle, self._taken = one_cycle(share * self._peak, n_steps), 0
-        self._rate = torch.where(models & ~self._failed, self._rate, 0.0)
+        self._rate = torch.where(models & ~self.failed, self._rate, 0.0)
         self._slowed = True
 
     def finish(self, step: int) -> None:
         """Look once more; a stage that ends worse than it began is a failure."""
         self.look(step)
         worse = self._kept > self._first + self._first.abs().clamp_min(1.0)
-        for i in (worse & ~self._failed).nonzero()[:, 0].tolist():
+        for i in (worse & ~self.failed).nonzero()[:, 0].tolist():
             self._fail(
                 i,
                 f"its loss ended at {self._kept[i]:.3g} and was {self._first[i]:.3g} at the "
@@ -189,7 +195,7 @@ class GuardedAdam:
         allowed = self._best + TOLERANCE * self._best.abs().clamp_min(1.0)
         bad = ~loss.isfinite() | (loss > allowed) | (self._last > allowed)
         bad |= ~self._flat.detach().isfinite().all(1)
-        bad &= ~self._failed
+        bad &= ~self.failed
         self._best = torch.where(bad, self._best, torch.minimum(self._best, loss))
         self._kept = torch.where(bad, self._kept, loss)
         self._begins = self._begins and bool(self._best.isinf().all())
@@ -215,7 +221,7 @@ class GuardedAdam:
 
     def _fail(self, model: int, why: str) -> None:
         """Leave a model as it is from now on."""
-        self._failed[model], self._rate[model] = True, 0.0
+        self.failed[model], self._rate[model] = True, 0.0
         self.failures[model] = TrainingError(
             f"ImitationFlow did not converge on {self._names[model]!r}: {why}. Lower learning_rate "
             "or the weights."

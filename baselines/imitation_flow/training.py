@@ -164,7 +164,8 @@ def _one_thread() -> Iterator[None]:
 def _train(
     config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
 ) -> list[Trained | TrainingError]:
-    with _one_thread():
+    # What overflows is noticed by its loss.
+    with _one_thread(), np.errstate(all="ignore"):
         return _train_batch(config, tasks, rngs)
 
 
@@ -209,7 +210,12 @@ def _train_batch(
         weights, terms = zip(*weighted, strict=True)
         losses = evaluate(flow, latent, data, terms)
         loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
-        adam.step(step, stage, loss)
+        if calm is None or not calm.raised:
+            adam.step(step, stage, loss)
+            return
+        # Motions that are watched end, and the calm is the last of their terms.
+        more = (calm.weight - 1) * resolved.calm_weight * losses[-1]
+        adam.step(step, stage, loss + more, judged=loss)
 
     watched = None if data.cyclic else calm
     every = max(1, n_steps // N_WATCHES)
@@ -219,21 +225,22 @@ def _train_batch(
         take(step, _stage(config, step, data))
         if len(adam.failures) == len(tasks):
             return [adam.failures[m] for m in range(len(tasks))]
+    adam.finish(n_steps)
     calmness: list[Calmness | None] = [None] * len(tasks)
     if watched is not None:
         rounds, peak = [0] * len(tasks), _peak(watched, flow, latent)
         n_more = math.ceil(CALM_SHARE * n_steps)
         for i in range(CALM_ROUNDS):
-            loud = peak > LOUD
+            loud = (peak > LOUD) & ~adam.failed
             if not bool(loud.any()):
                 break
             adam.resume(n_steps, CALMING + i, loud, n_more, CALM_RATE)
             for step in range(n_steps, n_steps + n_more):
                 take(step, CALMING + i)
+            adam.look(n_steps)
             rounds = [k + int(more) for k, more in zip(rounds, loud.tolist(), strict=True)]
             peak = _peak(watched, flow, latent)
         calmness = [Calmness(*pair) for pair in zip(peak.tolist(), rounds, strict=True)]
-    adam.finish(n_steps)
     if _stage(config, n_steps, data) == WHOLE:
         _fit_noise(flow, latent, data, rngs)
     flow, latent = flow.to("cpu"), latent.to("cpu")
