@@ -65,6 +65,7 @@ class Calm:
         self._data, self._n_new, self._limit = data, sampling.n_points // 2, limit
         self._step = sampling.step
         self._kept: Points | None = None
+        self._kept_excess = data.peak_speed[:, :0]
         self._n_sweeps = 0
         self.raised = False
         self.weight = torch.ones_like(data.peak_speed[:, 0])
@@ -78,33 +79,44 @@ class Calm:
         if self._kept is not None:
             points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
         excess = yield from self._excess(points)
-        self._kept = _fastest(points, excess.detach(), self._n_new)
+        self._keep(points, excess.detach())
         return torch.relu(excess).square().mean(1)
 
     def sweep(self, flow: Flow, latent: Latent) -> Tensor:
         """Return each model's fastest speed over a lattice in the recordings' peak, (m,).
 
-        No two sweeps have the same lattice. The next step looks at the fastest states.
+        No two sweeps have the same lattice. The next step looks at the fastest states, of these
+        and of the step before.
         """
         points = self._lattice()
         with torch.no_grad():
             (excess,) = evaluate(flow, latent, self._data, [self._excess(points)])
-        known, speeds = self._kept, _fastest(points, excess, self._n_new)
-        # Half of what the next step looks at again is from here, and half from the step before.
-        half = self._n_new // 2
-        self._kept = speeds if known is None else Points(
-            *(torch.cat([a[..., : self._n_new - half], b[..., :half]], -1)
-              for a, b in zip(known, speeds, strict=True))
-        )  # fmt: skip
+        if self._kept is not None:
+            points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
+            self._keep(points, torch.cat([self._kept_excess, excess], -1))
+        else:
+            self._keep(points, excess)
         return self._limit * torch.exp(excess.amax(1))
 
-    def watch(self, flow: Flow, latent: Latent) -> Tensor:
-        """Sweep, double the weight of models that are loud, and halve that of others."""
-        loudness = self.sweep(flow, latent)
-        changed = torch.where(loudness > LOUD, 2 * self.weight, self.weight / 2)
+    def watch(self, flow: Flow, latent: Latent, n_sweeps: int = 1) -> Tensor:
+        """Sweep, double the weight of models that are loud and halve that of others.
+
+        Returns the fastest speeds, (m,).
+        """
+        speeds = torch.stack([self.sweep(flow, latent) for _ in range(n_sweeps)]).amax(0)
+        changed = torch.where(speeds > LOUD, 2 * self.weight, self.weight / 2)
         self.weight = changed.clamp(1.0, MOST_WEIGHT)
         self.raised = bool((self.weight > 1).any())
-        return loudness
+        return speeds
+
+    def _keep(self, points: Points, excess: Tensor) -> None:
+        """Keep the fastest of points, with their excess (m, q), for the next step."""
+        y, among = points
+        self._kept_excess, fastest = excess.topk(self._n_new, dim=1)
+        self._kept = Points(
+            torch.gather(y, 2, fastest[:, None].expand(-1, y.shape[1], -1)),
+            torch.gather(among, 1, fastest),
+        )
 
     def _excess(self, points: Points) -> Generator[Points | Starts, Any, Tensor]:
         """Ask for the logarithm of speed over `limit` times the peak at points, (m, n)."""
@@ -132,13 +144,3 @@ class Calm:
         states = data.centre + REACH * data.half * unit
         among = torch.arange(unit.shape[1], device=data.device) % data.n_recordings
         return Points(states, among.expand(data.n_models, -1))
-
-
-def _fastest(points: Points, excess: Tensor, n: int) -> Points:
-    """Return the n points of each model with the largest excess (m, q)."""
-    y, among = points
-    fastest = excess.topk(n, dim=1).indices
-    return Points(
-        torch.gather(y, 2, fastest[:, None].expand(-1, y.shape[1], -1)),
-        torch.gather(among, 1, fastest),
-    )

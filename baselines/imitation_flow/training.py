@@ -228,7 +228,7 @@ def _train_batch(
     adam.finish(n_steps)
     calmness: list[Calmness | None] = [None] * len(tasks)
     if watched is not None:
-        rounds, peak = [0] * len(tasks), _peak(watched, flow, latent)
+        rounds, peak = [0] * len(tasks), watched.watch(flow, latent, N_SWEEPS)
         n_more = math.ceil(CALM_SHARE * n_steps)
         for i in range(CALM_ROUNDS):
             loud = (peak > LOUD) & ~adam.failed
@@ -239,7 +239,7 @@ def _train_batch(
                 take(step, CALMING + i)
             adam.look(n_steps)
             rounds = [k + int(more) for k, more in zip(rounds, loud.tolist(), strict=True)]
-            peak = _peak(watched, flow, latent)
+            peak = watched.watch(flow, latent, N_SWEEPS)
         calmness = [Calmness(*pair) for pair in zip(peak.tolist(), rounds, strict=True)]
     if _stage(config, n_steps, data) == WHOLE:
         _fit_noise(flow, latent, data, rngs)
@@ -248,12 +248,6 @@ def _train_batch(
         adam.failures.get(m) or Trained(flow, latent, m, adam.restarts[m], calmness[m])
         for m in range(len(tasks))
     ]
-
-
-def _peak(calm: Calm, flow: Flow, latent: Latent) -> Tensor:
-    """Return each model's fastest speed over several lattices, (m,), and weigh it."""
-    peaks = [calm.sweep(flow, latent) for _ in range(N_SWEEPS - 1)]
-    return torch.stack([*peaks, calm.watch(flow, latent)]).amax(0)
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
