@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from iflow_gym.baselines.imitation_flow import ImitationFlow, kernels
-from iflow_gym.baselines.imitation_flow.config import STEPS
+from iflow_gym.baselines.imitation_flow.config import ENDS
 from iflow_gym.datasets.lasa import SINGLE_MOTIONS, load_lasa
 from iflow_gym.metrics import box_diagonal, dtw, frechet, rmse, start_grid
 
@@ -28,7 +28,7 @@ class Options:
     """Or "generalisation"."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the fits, one run of all shapes each."""
-    n_steps: tuple[int, ...] = (STEPS,)
+    n_steps: tuple[int, ...] = (ENDS.n_steps,)
     """Steps of training; several give the curve of accuracy against seconds."""
     calm: bool = True
     """False leaves the calm penalty out, for comparison."""

@@ -104,10 +104,15 @@ class Calm:
         Returns the fastest speeds, (m,).
         """
         speeds = torch.stack([self.sweep(flow, latent) for _ in range(n_sweeps)]).amax(0)
-        changed = torch.where(speeds > LOUD, 2 * self.weight, self.weight / 2)
+        changed = torch.where(self.loud(speeds), 2 * self.weight, self.weight / 2)
         self.weight = changed.clamp(1.0, MOST_WEIGHT)
         self.raised = bool((self.weight > 1).any())
         return speeds
+
+    @staticmethod
+    def loud(speeds: Tensor) -> Tensor:
+        """Return which models are too fast somewhere, (m,), by their fastest speeds."""
+        return speeds > LOUD
 
     def _keep(self, points: Points, excess: Tensor) -> None:
         """Keep the fastest of points, with their excess (m, q), for the next step."""

@@ -38,7 +38,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from torch import Tensor
 
-from iflow_gym.baselines.imitation_flow.calm import LOUD, Calm, Sampling
+from iflow_gym.baselines.imitation_flow.calm import Calm, Sampling
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
@@ -183,7 +183,8 @@ def _train_batch(
     flow = make_flow(config, *sizes, generators, cyclic=data.cyclic).to(device)
     latent = _make_latent(config, tasks).to(device)
     draws = Draws(rngs, _numbers_a_step(config, data), device)
-    n_steps = config.steps(cyclic=data.cyclic)
+    resolved = _resolved(config, data)
+    n_steps = resolved.n_steps
     adam = GuardedAdam(
         [*((p, 1) for p in flow.parameters()), *((p, 0) for p in latent.parameters())],
         [task.name for task in tasks],
@@ -191,7 +192,6 @@ def _train_batch(
         learning_rate=config.learning_rate,
         max_norm=config.max_gradient_norm,
     )
-    resolved = _resolved(config, data)
     calm = None
     if resolved.calm_weight and config.objective == "reproduction":
         sampling = CALM_CYCLES if data.cyclic else CALM_ENDS
@@ -231,7 +231,7 @@ def _train_batch(
         rounds, peak = [0] * len(tasks), watched.watch(flow, latent, N_SWEEPS)
         n_more = math.ceil(CALM_SHARE * n_steps)
         for i in range(CALM_ROUNDS):
-            loud = (peak > LOUD) & ~adam.failed
+            loud = watched.loud(peak) & ~adam.failed
             if not bool(loud.any()):
                 break
             adam.resume(n_steps, CALMING + i, loud, n_more, CALM_RATE)
@@ -308,12 +308,11 @@ def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
     """Whether a step minimises the likelihood, whole reproductions, or the orbit's error too."""
     if config.objective == "paper":
         return LIKELIHOOD
+    resolved = _resolved(config, data)
     if data.cyclic:
-        n_steps = config.steps(cyclic=True)
-        held = _resolved(config, data).orbit_weight > 0
-        return ORBIT if held and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
-    n_steps = config.steps(cyclic=False)
-    return WHOLE if step >= config.likelihood_fraction * n_steps else LIKELIHOOD
+        held = resolved.orbit_weight > 0
+        return ORBIT if held and step >= ORBIT_FRACTION * resolved.n_steps else LIKELIHOOD
+    return WHOLE if step >= config.likelihood_fraction * resolved.n_steps else LIKELIHOOD
 
 
 def _resolved(config: ImitationFlowConfig, data: Recordings) -> Resolved:
