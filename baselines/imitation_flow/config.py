@@ -116,8 +116,9 @@ class ImitationFlowConfig:
     noise in proportion to the distance from the attractor, the state comes to rest there."""
     n_jobs: int = 1
     """Processes of one thread that models trained together are dealt out to: those of as many
-    recordings and dimensions, as a batch has to be; motions of which no two are alike train one
-    after the other, whatever it is. What trains beside a model changes its rounding, see `ImitationFlow`."""
+    recordings and dimensions, as a batch has to be. Motions of which no two are alike train one
+    after the other all the same. What trains beside a model changes its rounding, see
+    `ImitationFlow`."""
     device: str = "auto"
     """Where training runs: "auto" takes a GPU where torch has one; or a torch device."""
 
