@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 WINDOW = 25
 """Steps between two looks."""
@@ -35,7 +36,8 @@ WARM_UP = 0.15
 BETAS = (0.9, 0.99)
 """Adam's decays; the first is cycled."""
 
-MOMENTS = ("exp_avg", "exp_avg_sq")
+EPSILON = 1e-8
+"""Adam's."""
 
 
 class TrainingError(RuntimeError):
@@ -120,7 +122,8 @@ class GuardedAdam:
         self._parameters, self._axes = zip(*parameters, strict=True)
         self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
         self._make_views()
-        self._optimizer = torch.optim.Adam([self._flat], lr=learning_rate, betas=BETAS, fused=True)
+        self._moments = [torch.zeros_like(self._flat.data) for _ in range(2)]
+        self._n_taken = torch.zeros((), dtype=torch.float32, device=self._flat.device)
         self._cycle, self._taken = one_cycle(learning_rate, n_steps), 0
         like = self._flat.detach()[:, 0]
         self._rate, self._sum = torch.ones_like(like), torch.zeros_like(like)
@@ -145,7 +148,7 @@ class GuardedAdam:
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
             self._begins = bool(self._best.isinf().all())
         gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
-        self._flat.grad = gradient = self._joined(
+        gradient = self._joined(
             [torch.zeros_like(p) if g is None else g
              for g, p in zip(gradients, self._parameters, strict=True)]
         )  # fmt: skip
@@ -159,11 +162,7 @@ class GuardedAdam:
         self._sum += self._last
         self._count += 1
         before = self._flat.detach().clone() if self._slowed else None
-        (group,) = self._optimizer.param_groups
-        group["lr"], decay = self._cycle[self._taken]
-        group["betas"] = decay, BETAS[1]
-        self._taken += 1
-        self._optimizer.step()
+        self._adam(gradient)
         if before is not None:
             self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
         if self._count == WINDOW:
@@ -234,10 +233,20 @@ class GuardedAdam:
             self._stage, self._begins = stage, True
             self._best.fill_(torch.inf)
 
+    def _adam(self, gradient: Tensor) -> None:
+        """Take Adam's step: torch's function, without what its optimizer does around it."""
+        rate, decay = self._cycle[self._taken]
+        self._taken += 1
+        mean, square = self._moments
+        adam(
+            [self._flat.data], [gradient], [mean], [square], [], [self._n_taken],
+            fused=True, amsgrad=False, maximize=False,
+            beta1=decay, beta2=BETAS[1], lr=rate, weight_decay=0.0, eps=EPSILON,
+        )  # fmt: skip
+
     def _state(self) -> list[Tensor]:
-        """Return the parameters and Adam's moments, zero before the first step."""
-        state, data = self._optimizer.state[self._flat], self._flat.data
-        return [data, *(state.get(name, torch.zeros_like(data)) for name in MOMENTS)]
+        """Return the parameters and Adam's moments."""
+        return [self._flat.data, *self._moments]
 
     def _joined(self, tensors: Sequence[Tensor]) -> Tensor:
         """Join tensors of the parameters' shapes to (m, p)."""

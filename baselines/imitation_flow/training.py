@@ -78,7 +78,7 @@ CALM_ROUNDS, CALM_SHARE, CALM_RATE = 6, 0.05, 0.1
 """A motion that ends and is loud at the end is trained on in so many rounds at most, each a share
 of the steps, with a share of the rate."""
 
-N_SWEEPS = 4
+N_SWEEPS = 16
 """Lattices that say whether a model is loud at the end."""
 
 ORBIT_FRACTION = 0.3
