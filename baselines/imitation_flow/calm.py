@@ -10,7 +10,7 @@ halved again, down to what it was.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -25,7 +25,8 @@ REACH = 2.0
 """Speeds are looked at in so many times the recordings' box."""
 
 LOUD = 4.0
-"""Speed in the recordings' peak from which the weight is doubled."""
+"""Speed, in the recordings' peak, from which a model's weight is doubled, and from which it is
+trained on at the end. Speeds between the states of a lattice may be a little higher."""
 
 LATTICE = 1600
 """States of a sweep, about."""
@@ -41,6 +42,30 @@ class Sampling(NamedTuple):
     """States in a step's penalty."""
     step: float
     """The speed is the mean over this fraction of the duration."""
+
+
+class Calmness(NamedTuple):
+    """How calm a trained model is, and what it took."""
+
+    peak: float
+    """Fastest speed that was found in twice the recordings' box, in the recordings' peak speed."""
+    rounds: int
+    """Rounds of training that were added because it was loud at the end."""
+
+
+def calmness_of(header: Mapping[str, Any]) -> Calmness | None:
+    """Return the calmness that a model file's header holds; None where it does not speak of it.
+
+    Raises ValueError for anything that training does not record.
+    """
+    if (entry := header.get("calm")) is None:
+        return None
+    found = Calmness(*entry)
+    if type(found.peak) is not float or not found.peak >= 0:
+        raise ValueError(f"expected a peak speed >= 0, got {found.peak!r}")
+    if type(found.rounds) is not int or found.rounds < 0:
+        raise ValueError(f"expected rounds >= 0, got {found.rounds!r}")
+    return found
 
 
 class Calm:

@@ -118,7 +118,7 @@ class GuardedAdam:
         learning_rate: float,
         max_norm: float,
     ) -> None:
-        self._names, self._max_norm, self._peak = list(names), max_norm, learning_rate
+        self._names, self._max_norm = list(names), max_norm
         self._parameters, self._axes = zip(*parameters, strict=True)
         self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
         self._make_views()
@@ -142,7 +142,10 @@ class GuardedAdam:
         Where the loss has weights that change within a stage, what is judged is one without.
         """
         judged = loss.detach() if judged is None else judged.detach()
-        self._stage_is(step, stage)
+        if stage != self._stage:
+            self.look(step)
+            self._stage, self._begins = stage, True
+            self._best.fill_(torch.inf)
         if self._begins:  # a stage begins: what it has to be better than
             self._first = judged.clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
@@ -167,13 +170,6 @@ class GuardedAdam:
             self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
         if self._count == WINDOW:
             self.look(step)
-
-    def resume(self, step: int, stage: int, models: Tensor, n_steps: int, share: float) -> None:
-        """Go on for n_steps in a new stage, with a share of the peak rate; other models rest."""
-        self._stage_is(step, stage)
-        self._cycle, self._taken = one_cycle(share * self._peak, n_steps), 0
-        self._rate = torch.where(models & ~self.failed, self._rate, 0.0)
-        self._slowed = True
 
     def finish(self, step: int) -> None:
         """Look once more; a stage that ends worse than it began is a failure."""
@@ -225,13 +221,6 @@ class GuardedAdam:
             f"ImitationFlow did not converge on {self._names[model]!r}: {why}. Lower learning_rate "
             "or the weights."
         )
-
-    def _stage_is(self, step: int, stage: int) -> None:
-        """Begin a stage, if it is another one."""
-        if stage != self._stage:
-            self.look(step)
-            self._stage, self._begins = stage, True
-            self._best.fill_(torch.inf)
 
     def _adam(self, gradient: Tensor) -> None:
         """Take Adam's step: torch's function, without what its optimizer does around it."""

@@ -30,15 +30,14 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
-from iflow_gym.baselines.imitation_flow.calm import Calm, Sampling
+from iflow_gym.baselines.imitation_flow.calm import Calm, Calmness, Sampling
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
@@ -75,8 +74,8 @@ N_WATCHES = 40
 """Sweeps for fast places in the training of motions that end."""
 
 CALM_ROUNDS, CALM_SHARE, CALM_RATE = 6, 0.05, 0.1
-"""A motion that ends and is loud at the end is trained on in so many rounds at most, each a share
-of the steps, with a share of the rate."""
+"""A model that is loud at the end is trained on, alone, in so many rounds at most, each of a share
+of the steps and with a share of the rate."""
 
 N_SWEEPS = 16
 """Lattices that say whether a model is loud at the end."""
@@ -84,22 +83,13 @@ N_SWEEPS = 16
 ORBIT_FRACTION = 0.3
 """Share of a cycle's steps that maximise the likelihood alone before its orbit counts."""
 
-LIKELIHOOD, WHOLE, ORBIT, CALMING = 0, 1, 2, 3
+LIKELIHOOD, WHOLE, ORBIT = 0, 1, 2
 """Stages: losses are of one kind within each."""
 
 NOISE_STEPS = 100
 NOISE_HORIZONS = 100
 NOISE_PAIRS = 20
 NOISE_RATE = 0.1
-
-
-class Calmness(NamedTuple):
-    """How calm a trained model is, and what it took."""
-
-    peak: float
-    """Fastest speed that was found in twice the recordings' box, in the recordings' peak speed."""
-    rounds: int
-    """Rounds of training that were added, since it was loud at the end."""
 
 
 @dataclass(frozen=True)
@@ -177,77 +167,140 @@ def _train_batch(
         if config.device == "auto"
         else config.device
     )
-    data = Recordings(tasks, device)
     generators = [torch.Generator().manual_seed(int(rng.integers(2**63))) for rng in rngs]
-    sizes = (data.n_dims, tasks[0].n_context)
-    flow = make_flow(config, *sizes, generators, cyclic=data.cyclic).to(device)
-    latent = _make_latent(config, tasks).to(device)
-    draws = Draws(rngs, _numbers_a_step(config, data), device)
-    resolved = _resolved(config, data)
-    n_steps = resolved.n_steps
-    adam = GuardedAdam(
-        [*((p, 1) for p in flow.parameters()), *((p, 0) for p in latent.parameters())],
-        [task.name for task in tasks],
-        n_steps=n_steps,
-        learning_rate=config.learning_rate,
-        max_norm=config.max_gradient_norm,
-    )
-    calm = None
-    if resolved.calm_weight and config.objective == "reproduction":
-        sampling = CALM_CYCLES if data.cyclic else CALM_ENDS
-        calm = Calm(data, sampling, config.calm_speed)
-    orbit_weight = resolved.orbit_weight
-    held = data.cyclic and orbit_weight > 0
-    orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
-
-    def take(step: int, stage: int) -> None:
-        """Take one step of a stage."""
-        draws.new_step()
-        weighted = _terms(config, step, latent, data, draws, calm)
-        if orbit is not None and stage == ORBIT:
-            assert isinstance(latent, LimitCycleLatent)
-            weighted.append((orbit_weight, orbit(latent)))
-        weights, terms = zip(*weighted, strict=True)
-        losses = evaluate(flow, latent, data, terms)
-        loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
-        if calm is None or not calm.raised:
-            adam.step(step, stage, loss)
-            return
-        # Motions that are watched end, and the calm is the last of their terms.
-        more = (calm.weight - 1) * resolved.calm_weight * losses[-1]
-        adam.step(step, stage, loss + more, judged=loss)
-
-    watched = None if data.cyclic else calm
+    batch = _Batch(config, tasks, rngs, generators, device)
+    n_steps, calm = batch.resolved.n_steps, batch.watched
+    adam = batch.optimizer(n_steps, config.learning_rate)
     every = max(1, n_steps // N_WATCHES)
     for step in range(n_steps):
-        if watched is not None and step and step % every == 0:
-            watched.watch(flow, latent)
-        take(step, _stage(config, step, data))
+        if calm is not None and step and step % every == 0:
+            calm.watch(batch.flow, batch.latent)
+        batch.step(adam, step, _stage(config, step, batch.data))
         if len(adam.failures) == len(tasks):
             return [adam.failures[m] for m in range(len(tasks))]
     adam.finish(n_steps)
     calmness: list[Calmness | None] = [None] * len(tasks)
-    if watched is not None:
-        rounds, peak = [0] * len(tasks), watched.watch(flow, latent, N_SWEEPS)
-        n_more = math.ceil(CALM_SHARE * n_steps)
-        for i in range(CALM_ROUNDS):
-            loud = watched.loud(peak) & ~adam.failed
-            if not bool(loud.any()):
-                break
-            adam.resume(n_steps, CALMING + i, loud, n_more, CALM_RATE)
-            for step in range(n_steps, n_steps + n_more):
-                take(step, CALMING + i)
-            adam.look(n_steps)
-            rounds = [k + int(more) for k, more in zip(rounds, loud.tolist(), strict=True)]
-            peak = watched.watch(flow, latent, N_SWEEPS)
-        calmness = [Calmness(*pair) for pair in zip(peak.tolist(), rounds, strict=True)]
-    if _stage(config, n_steps, data) == WHOLE:
-        _fit_noise(flow, latent, data, rngs)
-    flow, latent = flow.to("cpu"), latent.to("cpu")
+    if calm is not None:
+        speeds = calm.watch(batch.flow, batch.latent, N_SWEEPS)
+        for m, speed in enumerate(speeds.tolist()):
+            calmness[m] = Calmness(speed, 0)
+            if bool(calm.loud(speeds)[m]) and m not in adam.failures:
+                alone = _Batch(config, [tasks[m]], [rngs[m]], [generators[m]], device)
+                alone.take(batch, m)
+                calmness[m], restarts = _calm_down(config, alone, n_steps)
+                adam.restarts[m] += restarts
+                alone.give(batch, m)
+    if _stage(config, n_steps, batch.data) == WHOLE:
+        _fit_noise(batch.flow, batch.latent, batch.data, rngs)
+    flow, latent = batch.flow.to("cpu"), batch.latent.to("cpu")
     return [
         adam.failures.get(m) or Trained(flow, latent, m, adam.restarts[m], calmness[m])
         for m in range(len(tasks))
     ]
+
+
+class _Batch:
+    """Models that train together, and what a step of theirs needs."""
+
+    def __init__(
+        self,
+        config: ImitationFlowConfig,
+        tasks: Sequence[Task],
+        rngs: Sequence[np.random.Generator],
+        generators: list[torch.Generator],
+        device: torch.device,
+    ) -> None:
+        self._config, self._names = config, [task.name for task in tasks]
+        self.data = data = Recordings(tasks, device)
+        self.resolved = resolved = _resolved(config, data)
+        sizes = (data.n_dims, tasks[0].n_context)
+        self.flow = make_flow(config, *sizes, generators, cyclic=data.cyclic).to(device)
+        self.latent = _make_latent(config, tasks).to(device)
+        self._draws = Draws(rngs, _numbers_a_step(config, data), device)
+        self._calm: Calm | None = None
+        if resolved.calm_weight and config.objective == "reproduction":
+            sampling = CALM_CYCLES if data.cyclic else CALM_ENDS
+            self._calm = Calm(data, sampling, config.calm_speed)
+        self._orbit: MeanOrbit | None = None
+        if data.cyclic and resolved.orbit_weight > 0:
+            self._orbit = MeanOrbit(tasks, data, config.orbit_resolution)
+
+    @property
+    def watched(self) -> Calm | None:
+        """The calm of motions that end, whose weight grows with need."""
+        return None if self.data.cyclic else self._calm
+
+    @property
+    def parameters(self) -> list[tuple[nn.Parameter, int]]:
+        """All parameters, with the axis that counts the models."""
+        return [
+            *((p, 1) for p in self.flow.parameters()),
+            *((p, 0) for p in self.latent.parameters()),
+        ]
+
+    def optimizer(self, n_steps: int, learning_rate: float) -> GuardedAdam:
+        """Return an optimizer of all parameters."""
+        return GuardedAdam(
+            self.parameters,
+            self._names,
+            n_steps=n_steps,
+            learning_rate=learning_rate,
+            max_norm=self._config.max_gradient_norm,
+        )
+
+    def step(self, adam: GuardedAdam, step: int, stage: int) -> None:
+        """Take one step of a stage."""
+        self._draws.new_step()
+        terms = _terms(self._config, step, stage, self.latent, self.data, self._draws)
+        calm, calm_weight = self._calm, self.resolved.calm_weight
+        if calm is not None:
+            terms.append((calm_weight, calm(self._draws)))
+        if self._orbit is not None and stage == ORBIT:
+            assert isinstance(self.latent, LimitCycleLatent)
+            terms.append((self.resolved.orbit_weight, self._orbit(self.latent)))
+        losses = evaluate(self.flow, self.latent, self.data, [term for _, term in terms])
+        loss = torch.stack([w * x for (w, _), x in zip(terms, losses, strict=True)]).sum(0)
+        if calm is None or not calm.raised:
+            adam.step(step, stage, loss)
+            return
+        # Motions that are watched end, and the calm is the last of their terms.
+        more = (calm.weight - 1) * calm_weight * losses[-1]
+        adam.step(step, stage, loss + more, judged=loss)
+
+    def take(self, other: _Batch, model: int) -> None:
+        """Become one model of another batch."""
+        for (mine, axis), (theirs, _) in zip(self.parameters, other.parameters, strict=True):
+            mine.data.copy_(theirs.data.narrow(axis, model, 1))
+        if self._calm is not None and other._calm is not None:
+            self._calm.weight = other._calm.weight[model : model + 1]
+            self._calm.raised = True
+
+    def give(self, other: _Batch, model: int) -> None:
+        """Put the only model of this batch in its place in another one."""
+        for (mine, axis), (theirs, _) in zip(self.parameters, other.parameters, strict=True):
+            theirs.data.narrow(axis, model, 1).copy_(mine.data)
+
+
+def _calm_down(
+    config: ImitationFlowConfig, batch: _Batch, n_steps: int
+) -> tuple[Calmness, list[Restart]]:
+    """Train one model on after n_steps, with the weight of its calm doubled from round to round.
+
+    Alone, so that neither its random numbers nor its neighbours' depend on each other.
+    """
+    calm, more = batch.watched, math.ceil(CALM_SHARE * n_steps)
+    assert calm is not None
+    speeds, rounds = calm.watch(batch.flow, batch.latent, N_SWEEPS), 0
+    restarts: list[Restart] = []
+    while rounds < CALM_ROUNDS and bool(calm.loud(speeds)):
+        adam = batch.optimizer(more, CALM_RATE * config.learning_rate)
+        for step in range(n_steps + rounds * more, n_steps + (rounds + 1) * more):
+            batch.step(adam, step, _stage(config, n_steps, batch.data))
+        adam.look(n_steps + (rounds + 1) * more)
+        restarts += adam.restarts[0]
+        rounds += 1
+        speeds = calm.watch(batch.flow, batch.latent, N_SWEEPS)
+    return Calmness(float(speeds), rounds), restarts
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
@@ -268,17 +321,17 @@ def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
 def _terms(
     config: ImitationFlowConfig,
     step: int,
+    stage: int,
     latent: Latent,
     data: Recordings,
     draws: Draws,
-    calm: Calm | None,
 ) -> list[tuple[float, Term]]:
-    """Return the weighted terms of a step."""
+    """Return the weighted terms of a step, but for the calm and the orbit."""
     q, p = N_HORIZONS, max(1, config.n_pairs // N_HORIZONS)
     if config.objective == "paper":
         return [(1.0, backward_likelihood(latent, data, draws, q, p))]
     terms: list[tuple[float, Term]] = []
-    whole = _stage(config, step, data) == WHOLE
+    whole = stage == WHOLE
     turn = step % TURNS
     weight = TURNS * config.likelihood_weight * (turn == 0) if whole else 1.0
     if weight:
@@ -299,8 +352,6 @@ def _terms(
         if config.tube_weight and turn == TURNS // 2:
             beside = tube(data, draws, max(n // 2, 1), width=config.tube_width)
             terms.append((TURNS * weight * config.tube_weight, beside))
-    if calm is not None:
-        terms.append((_resolved(config, data).calm_weight, calm(draws)))
     return terms
 
 
