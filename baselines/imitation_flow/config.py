@@ -44,8 +44,10 @@ class ImitationFlowConfig:
     """Settings of `ImitationFlow`; lengths are in units of the motion, times in its duration."""
 
     objective: Objective = "reproduction"
-    """"reproduction": forward likelihood, then the squared error of whole reproductions.
-    "paper": the backward likelihood of Algorithm 1 and nothing else."""
+    """"reproduction": forward likelihood, then the squared error of whole reproductions; where
+    motions repeat forward likelihood and stationary density, and in space the orbit's likelihood.
+    "paper": Algorithm 1, the backward likelihood and the stationary density at the last sample.
+    Penalties on the field beside the recordings belong to the first."""
     emission: Emission = "coupling"
     """Layers of the flow: "coupling" (affine), "autoregressive" (masked, for three dimensions and
     more: the paper's for the robot), or "spline" (rational-quadratic couplings)."""
