@@ -187,7 +187,8 @@ def _train_batch(
             if bool(calm.loud(speeds)[m]) and m not in adam.failures:
                 alone = _Batch(config, [tasks[m]], [rngs[m]], [generators[m]], device)
                 alone.take(batch, m)
-                calmness[m], restarts = _calm_down(config, alone, n_steps)
+                slowed = adam.restarts[m][-1].rate if adam.restarts[m] else 1.0
+                calmness[m], restarts = _calm_down(config, alone, n_steps, CALM_RATE * slowed)
                 adam.restarts[m] += restarts
                 alone.give(batch, m)
     if _stage(config, n_steps, batch.data) == WHOLE:
@@ -282,10 +283,11 @@ class _Batch:
 
 
 def _calm_down(
-    config: ImitationFlowConfig, batch: _Batch, n_steps: int
+    config: ImitationFlowConfig, batch: _Batch, n_steps: int, rate: float
 ) -> tuple[Calmness, list[Restart]]:
     """Train one model on after n_steps, with the weight of its calm doubled from round to round.
 
+    The rate is a fraction of the learning rate, and falls where training diverges.
     Alone, so that neither its random numbers nor its neighbours' depend on each other.
     """
     calm, more = batch.watched, math.ceil(CALM_SHARE * n_steps)
@@ -293,11 +295,12 @@ def _calm_down(
     speeds, rounds = calm.watch(batch.flow, batch.latent, N_SWEEPS), 0
     restarts: list[Restart] = []
     while rounds < CALM_ROUNDS and bool(calm.loud(speeds)):
-        adam = batch.optimizer(more, CALM_RATE * config.learning_rate)
+        adam = batch.optimizer(more, rate * config.learning_rate)
         for step in range(n_steps + rounds * more, n_steps + (rounds + 1) * more):
             batch.step(adam, step, _stage(config, n_steps, batch.data))
         adam.look(n_steps + (rounds + 1) * more)
-        restarts += adam.restarts[0]
+        restarts += [Restart(step, rate * share) for step, share in adam.restarts[0]]
+        rate = restarts[-1].rate if adam.restarts[0] else rate
         rounds += 1
         speeds = calm.watch(batch.flow, batch.latent, N_SWEEPS)
     return Calmness(float(speeds), rounds), restarts
