@@ -287,8 +287,8 @@ def _calm_down(
 ) -> tuple[Calmness, list[Restart]]:
     """Train one model on after n_steps, with the weight of its calm doubled from round to round.
 
-    The rate is a fraction of the learning rate, and falls where training diverges.
-    Alone, so that neither its random numbers nor its neighbours' depend on each other.
+    Alone, so that neither its random numbers nor its neighbours' depend on each other. The rate is
+    a fraction of the learning rate, and falls where training diverges.
     """
     calm, more = batch.watched, math.ceil(CALM_SHARE * n_steps)
     assert calm is not None
