@@ -73,7 +73,7 @@ CALM_ENDS, CALM_CYCLES = Sampling(n_points=64, step=0.001), Sampling(n_points=32
 N_WATCHES = 40
 """Sweeps for fast places in the training of motions that end."""
 
-CALM_ROUNDS, CALM_SHARE, CALM_RATE = 6, 0.05, 0.1
+CALM_ROUNDS, CALM_SHARE, CALM_RATE = 6, 0.05, 0.3
 """A model that is loud at the end is trained on, alone, in so many rounds at most, each of a share
 of the steps and with a share of the rate."""
 
