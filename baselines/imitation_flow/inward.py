@@ -1,8 +1,8 @@
 """The penalty on motion away from the recordings, for motions that repeat in space.
 
 A flow may bend the way back to the orbit far around: stable all the same, but an arm meets the
-borders of its workspace on such a way, or a drum, and stays there. So at random states in twice the
-recordings' box, y at the distance d from the nearest recorded sample p, d is to shrink,
+borders of its workspace on such a way, or a drum, and stays there. So at random states in and around the recordings' box, y at the distance d from the nearest recorded
+sample p, d is to shrink,
 
     <dy/dt, (y - p) / d>  <=  -k d,
 
@@ -19,10 +19,17 @@ from torch import Tensor
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings
 from iflow_gym.baselines.imitation_flow.passes import Points, Starts, Term
 
+N_STATES = 32
+"""States in a step's penalty."""
+
+REACH = 2.5
+"""They are drawn from so many times the recordings' box: starts are in twice that, and what leads
+from there out of it would be seen too late."""
+
 STEP = 0.005
 """The mean velocity over this fraction of the duration is what counts."""
 
-RATE = 1.0
+RATE = 4.0
 """k, per duration."""
 
 NEAR = 0.1
@@ -35,8 +42,8 @@ SAMPLES = 100
 class Inward:
     """Squared excess of the velocity away from the recordings; the worst states are kept."""
 
-    def __init__(self, data: Recordings, n_points: int) -> None:
-        self._data, self._n_new = data, n_points // 2
+    def __init__(self, data: Recordings) -> None:
+        self._data, self._n_new = data, N_STATES // 2
         self._kept: Points | None = None
         n = torch.arange(SAMPLES, device=data.device)
         among = torch.arange(data.n_recordings, device=data.device).repeat_interleave(SAMPLES)
@@ -48,7 +55,7 @@ class Inward:
         data = self._data
         uniform = draws.uniform(data.n_dims, self._n_new)
         among = (draws.uniform(self._n_new) * data.n_recordings).long()
-        points = Points(data.centre + 2 * data.half * (2 * uniform - 1), among)
+        points = Points(data.centre + REACH * data.half * (2 * uniform - 1), among)
         if self._kept is not None:
             points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
         z, _ = yield points
