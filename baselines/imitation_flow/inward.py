@@ -1,8 +1,8 @@
 """The penalty on motion away from the recordings, for motions that repeat in space.
 
 A flow may bend the way back to the orbit far around: stable all the same, but an arm meets the
-borders of its workspace on such a way, or a drum, and stays there. So at random states in and around the recordings' box, y at the distance d from the nearest recorded
-sample p, d is to shrink,
+borders of its workspace on such a way, or a drum, and stays there. So at random states in and
+around the recordings' box, y at the distance d from the nearest recorded sample p, d is to shrink,
 
     <dy/dt, (y - p) / d>  <=  -k d,
 
