@@ -202,4 +202,12 @@ class ImitationFlowConfig:
         in_space = n_dims > 2 and self.objective == "reproduction"
         usual = (IN_SPACE if in_space else IN_PLANE) if cyclic else ENDS
         given = {name: getattr(self, name) for name in Resolved._fields}
-        return usual._replace(**{name: v for name, v in given.items() if v is not None})
+        found = usual._replace(**{name: v for name, v in given.items() if v is not None})
+        if found.orbit_weight > 0:
+            return found
+        if self.inward_weight:
+            raise ValueError(
+                f"Expected an orbit_weight > 0 with inward_weight={self.inward_weight}, got none: "
+                "the penalty belongs to the stage in which the orbit counts."
+            )
+        return found._replace(inward_weight=0.0)
