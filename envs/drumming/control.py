@@ -13,8 +13,9 @@ Limits. dq = a + s b, b the part that v commands and a the rest. s in [0, 1] is 
 with which every joint keeps its speed limit and its distance to its stops: near a stop the allowed
 approach is (distance) / 0.1 s. So a command that cannot be carried out is slowed as a whole, and
 never bent. The border of the workspace and the drums alone are slid along: what of v leads out of
-it faster than (distance) / 0.1 s is taken off, and the rest remains; drums are `keepout`'s. Slowed as a whole a policy would stand still
-there for ever, since the tip's position is all that it goes by.
+it faster than (distance) / 0.1 s is taken off, and the rest remains; for drums see `keepout`.
+Slowed as a whole a policy would stand still there for ever, since the tip's position is all that it
+goes by.
 
 Acceleration. v is not the command itself but the tip's present velocity plus the change to the
 command, shortened, along the command and across it, to `TIP_ACCELERATION` dt each. Far below what

@@ -54,7 +54,7 @@ def test_penalty_is_the_squared_excess_over_the_rate() -> None:
 
 def test_motion_beside_the_recordings_is_free() -> None:
     """On a circle's axis-parallel cylinder, going round changes no distance to the circle."""
-    inward, data, draws = circle()
+    inward, _, draws = circle()
 
     def round_and_in(inward, y):
         x = torch.stack([-y[:, 1], y[:, 0], torch.zeros_like(y[:, 0])], 1)
@@ -68,7 +68,7 @@ def test_worst_states_are_looked_at_again() -> None:
     inward, data, draws = circle()
     first = penalty(inward, draws, towards(0.0))[1]
     again = penalty(inward, draws, towards(0.0))[1]
-    assert first.shape[-1] == N_STATES // 2 and again.shape[-1] == N_STATES
+    assert (first.shape[-1], again.shape[-1]) == (N_STATES // 2, N_STATES)
     far = inward._from_nearest(first)[1].max()
     assert torch.isclose(inward._from_nearest(again)[1].max(), far) or (
         inward._from_nearest(again)[1].max() > far

@@ -26,7 +26,7 @@ def depth(point):
 
 def test_down_onto_a_head_is_slowed_towards_the_face_and_across_it_free():
     keep = KeepOut((RIGHT,))
-    above = OVER + [0.0, 0.0, 0.006]
+    above = OVER + np.array([0.0, 0.0, 0.006])
     np.testing.assert_allclose(
         keep.slid(above, np.array([0.3, -0.1, -0.5])), [0.3, -0.1, -0.006 / BRAKING_TIME]
     )
@@ -45,7 +45,7 @@ def test_into_a_wall_a_command_slides_along_it():
 
 def test_deep_inside_a_command_leads_out_the_nearer_way():
     keep = KeepOut((RIGHT,))
-    pressed = keep.slid(OVER - [0, 0, 0.003], np.array([0.1, 0.0, -0.2]))
+    pressed = keep.slid(OVER - np.array([0.0, 0.0, 0.003]), np.array([0.1, 0.0, -0.2]))
     assert pressed[2] == pytest.approx(0.003 / BRAKING_TIME)
     assert pressed[0] == 0.1
 
