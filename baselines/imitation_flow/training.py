@@ -263,16 +263,18 @@ class _Batch:
         if self._orbit is not None and stage == ORBIT:
             assert isinstance(self.latent, LimitCycleLatent)
             terms.append((self.resolved.orbit_weight, self._orbit(self.latent)))
-        if self._inward is not None and stage == ORBIT:
+        inward = self._inward is not None and stage == ORBIT
+        if self._inward is not None and inward:
             terms.append((self.resolved.inward_weight, self._inward(self._draws)))
         losses = evaluate(self.flow, self.latent, self.data, [term for _, term in terms])
-        loss = torch.stack([w * x for (w, _), x in zip(terms, losses, strict=True)]).sum(0)
-        if calm is None or not calm.raised:
-            adam.step(step, stage, loss)
-            return
-        # Motions that are watched end, and the calm is the last of their terms.
-        more = (calm.weight - 1) * calm_weight * losses[-1]
-        adam.step(step, stage, loss + more, judged=loss)
+        weighted = [w * x for (w, _), x in zip(terms, losses, strict=True)]
+        judged = loss = torch.stack(weighted).sum(0)
+        if calm is not None and calm.raised:
+            # Motions that are watched end, and the calm is the last of their terms.
+            loss = loss + (calm.weight - 1) * weighted[-1]
+        if inward:  # it looks for the worst states: no measure of how training goes
+            judged = judged - weighted[-1]
+        adam.step(step, stage, loss, judged=judged)
 
     def take(self, other: _Batch, model: int) -> None:
         """Become one model of another batch."""

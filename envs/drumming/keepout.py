@@ -8,7 +8,9 @@ sphere, so the cylinder is wider than the drum by its radius.
 
 With r the horizontal distance from the drum's axis, outside means above the face, r <= R and
 z >= f, or beside the wall, r >= R. Below the face and within the wall, the nearer of the two leads
-out.
+out. What a wall takes off a command it gives back upwards, up to `CLIMB`: in the wedge between a
+wall and the border of the workspace nothing would be left to slide with, and over a drum the way is
+free.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ FOLLOW_THROUGH: Final = 0.016
 BRAKING_TIME: Final = 0.03
 """The tip may approach a drum at the distance to it over this many seconds: a stroke is not
 slowed before it meets the head."""
+
+CLIMB: Final = 0.1
+"""Speed in m/s at most that a wall adds upwards."""
 
 RIM: Final = 0.007
 """How much wider than its head a drum is, in m."""
@@ -59,4 +64,5 @@ class KeepOut:
                 least, towards = -beside / BRAKING_TIME, float(out @ velocity)
                 if towards < least:
                     velocity = velocity + (least - towards) * out
+                    velocity[2] += min(least - towards, CLIMB)
         return velocity

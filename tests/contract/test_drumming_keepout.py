@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from iflow_gym.datasets.drums import DRUMS, LEFT, RIGHT, TIP_RADIUS
 from iflow_gym.envs.drumming.env import DrummingEnv
-from iflow_gym.envs.drumming.keepout import BRAKING_TIME, FOLLOW_THROUGH, RIM, KeepOut
+from iflow_gym.envs.drumming.keepout import BRAKING_TIME, CLIMB, FOLLOW_THROUGH, RIM, KeepOut
 
 FACE = RIGHT.head[2] + TIP_RADIUS - FOLLOW_THROUGH
 WALL = RIGHT.radius + RIM + TIP_RADIUS
@@ -33,12 +33,14 @@ def test_down_onto_a_head_is_slowed_towards_the_face_and_across_it_free():
     np.testing.assert_array_equal(keep.slid(above, np.array([0.3, 0.0, -0.1])), [0.3, 0.0, -0.1])
 
 
-def test_into_a_wall_a_command_slides_along_it():
+def test_into_a_wall_a_command_slides_along_it_and_up():
     keep = KeepOut((RIGHT,))
     beside = np.array([RIGHT.head[0], RIGHT.head[1] - WALL, 0.18])
     np.testing.assert_allclose(
-        keep.slid(beside, np.array([0.2, 0.4, 0.1])), [0.2, 0.0, 0.1], atol=1e-12
+        keep.slid(beside, np.array([0.2, 0.04, 0.1])), [0.2, 0.0, 0.14], atol=1e-12
     )
+    fast = keep.slid(beside, np.array([0.2, 0.4, 0.1]))
+    np.testing.assert_allclose(fast, [0.2, 0.0, 0.1 + CLIMB], atol=1e-12)
     away = np.array([0.2, -0.4, 0.1])
     np.testing.assert_array_equal(keep.slid(beside, away), away)
 
@@ -60,12 +62,14 @@ def test_no_command_leads_deeper_in_than_the_distance_allows(point, velocity):
 
 
 @given(point=vector, velocity=vector)
-def test_nothing_is_added_to_a_command_outside(point, velocity):
+def test_nothing_but_a_climb_is_added_to_a_command_outside(point, velocity):
     point = point + RIGHT.head
     if depth(point) <= 0:
         slid = KeepOut(DRUMS).slid(point, velocity)
         if depth_of(LEFT, point) <= 0:
-            assert np.linalg.norm(slid) <= np.linalg.norm(velocity) + 1e-12
+            assert np.linalg.norm(slid[:2]) <= np.linalg.norm(velocity[:2]) + 1e-12
+            assert slid[2] >= velocity[2]
+            assert slid[2] <= max(velocity[2], 0.0) + 2 * CLIMB + 1e-12
 
 
 def depth_of(drum, point):
