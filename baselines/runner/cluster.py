@@ -1,6 +1,6 @@
 """Runs jobs on the workers of a Dask cluster, as `pool` runs them on this machine.
 
-Plain futures of `distributed` are used, not joblib's Dask backend: a future a job can be given again
+Plain futures of `distributed` are used, not joblib's Dask backend: a job alone is given out again
 when its worker dies, without the others; a queue brings each record the moment it is known; and
 the plan of the run is sent once, as the result of a task that all jobs depend on. (Data that are
 scattered are lost with the workers that hold them; a task's result is made again.)
@@ -69,9 +69,7 @@ class Cluster:
         If Dask is not installed, or nothing answers at the address.
     """
 
-    def __init__(
-        self, folder: Path, scheduler: str, on_event: Callable[[Event], object]
-    ) -> None:
+    def __init__(self, folder: Path, scheduler: str, on_event: Callable[[Event], object]) -> None:
         self._folder = folder
         self._on_event = on_event
         self._done: set[str] = set()
