@@ -23,6 +23,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -74,13 +75,13 @@ class Cluster:
         self._on_event = on_event
         self._done: set[str] = set()
         try:
-            import distributed
+            dask: Any = import_module("distributed")
         except ImportError as error:
             raise ClusterError(
                 f"Expected Dask for --backend dask, got {error}: pip install 'iflow-gym[dask]'."
             ) from error
         try:
-            self._client = distributed.Client(scheduler, timeout=CONNECT_SECONDS)
+            self._client: Any = dask.Client(scheduler, timeout=CONNECT_SECONDS)
         except (OSError, ValueError) as error:
             raise ClusterError(
                 f"Expected a Dask scheduler at {scheduler}, got none within {CONNECT_SECONDS:g} s "
@@ -103,14 +104,12 @@ class Cluster:
         OSError
             If a record cannot be written.
         """
-        from distributed import Queue
-
         try:
             if not self._client.scheduler_info()["workers"]:
                 text = f"No workers yet at {self._client.scheduler.address}: waiting for them"
                 self._note(text)
             name = f"iflow-gym-{uuid.uuid4().hex}"
-            messages = Queue(name, client=self._client)
+            messages = import_module("distributed").Queue(name, client=self._client)
             try:
                 self._follow(list(jobs), messages, name)
             finally:
@@ -122,8 +121,7 @@ class Cluster:
 
     def _follow(self, jobs: list[Job], messages: Any, name: str) -> None:
         """Give all jobs out, write what comes back, and give out again what was lost."""
-        from distributed import KilledWorker
-
+        killed = import_module("distributed").KilledWorker
         shipment = self._client.submit(
             Shipment, tuple(jobs), _code_of(jobs), key=f"{name}-plan", pure=False
         )
@@ -148,7 +146,7 @@ class Cluster:
                         "The Dask scheduler is lost. What is done is kept; the next run goes on "
                         "from there."
                     )
-                if not isinstance(error, KilledWorker):
+                if not isinstance(error, killed):
                     raise ClusterError(f"A Dask worker could not do its work: {error}")
                 for number in numbers:
                     left = jobs[number].without(self._done)
@@ -213,10 +211,9 @@ def run_bundle(shipment: Shipment, numbers: Sequence[int], queue: str) -> None:
     Each event of the journal is put into the queue, with the record and the model of a cell that
     is done. The process is killed when the task is no longer wanted: the run was interrupted.
     """
-    from distributed import Queue, get_client, get_worker
-
-    messages = Queue(queue, client=get_client())
-    worker = get_worker()
+    dask: Any = import_module("distributed")
+    messages = dask.Queue(queue, client=dask.get_client())
+    worker = dask.get_worker()
     key = worker.get_current_task()
     with tempfile.TemporaryDirectory(prefix="iflow-gym-task-") as scratch:
         work = Path(scratch)

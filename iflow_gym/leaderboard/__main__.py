@@ -1,7 +1,9 @@
-"""Check a submission to the leaderboard.
+"""Check a submission to the leaderboard; compare two folders of results.
 
     python -m iflow_gym.leaderboard check leaderboard/results/gmr
     python -m iflow_gym.leaderboard check my_results/my-method --cells 10 --seed 0 --trust
+
+    python -m iflow_gym.leaderboard compare before/results after/results
 
 PATH is the folder of a method, or a folder of such folders. Its method.toml, records and models are
 read, nothing in them is run; then some cells, chosen at random, are scored again from their models.
@@ -35,7 +37,7 @@ def check(
     path
         Folder of a method, with its method.toml, or a folder of such folders.
     cells
-        Cells that are scored again.
+        Cells that are scored again; 0 looks at files alone.
     seed
         Seed by which they are chosen; by default one that nobody can foresee.
     trust
@@ -66,6 +68,26 @@ def check(
     return status
 
 
+def compare(before: Positional[Path], after: Positional[Path], /) -> int:
+    """Print, as Markdown, what changed between two folders of results.
+
+    Parameters
+    ----------
+    before
+        Folder of results.
+    after
+        Folder of results.
+    """
+    from iflow_gym.leaderboard.compare import changes
+
+    try:
+        print(changes(before, after))
+    except (OSError, ValueError) as error:
+        print(f"iflow_gym.leaderboard: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
 def _folders(path: Path) -> list[Path]:
     """Return the folder itself, or those in it where it is none of a method."""
     if not path.is_dir():
@@ -88,6 +110,7 @@ def main() -> None:
         sys.path.append(os.getcwd())  # for the classes of submissions
     app = tyro.extras.SubcommandApp()
     app.command(check)
+    app.command(compare)
     sys.exit(app.cli(description=__doc__, use_underscores=False))
 
 

@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from iflow_gym.baselines.registry import METHODS
+from iflow_gym.baselines.registry import METHODS, UnknownNameError
+from iflow_gym.baselines.runner.fingerprint import method_code
 from iflow_gym.leaderboard.contradictions import Contradiction, examine
 from iflow_gym.leaderboard.records import label, read_records, wrong_with
 from iflow_gym.leaderboard.rescoring import (
@@ -74,7 +75,7 @@ def check(
     n_cells
         How many cells are scored again from their models, chosen at random among those with scores.
         Cells that claim a proof and record a divergence, a spurious attractor or a growing Lyapunov
-        function are scored again beside them, a few.
+        function are scored again beside them, a few. 0 looks at files alone.
     seed
         Of the choice; None takes one that nobody can foresee. The report names it.
     trust
@@ -146,6 +147,8 @@ def _check_records(report: Report, submission: Submission | None) -> list[Result
 
 
 def _check_again(report: Report, records: list[Result], n_cells: int, *, trust: bool) -> None:
+    if n_cells == 0:
+        return
     rng = np.random.default_rng(report.seed)
     order = rng.permutation(len(records))
     chosen = [records[i] for i in sorted(order[:n_cells].tolist())]
@@ -179,6 +182,9 @@ def _again(result: Result, folder: Path) -> Iterator[Finding]:
     what = label(result)
     tolerance, why = tolerance_for(result)
     try:
+        module = str(result.target).partition(":")[0]
+        if method_code(module).sha256 != result.hashes.get("code"):
+            yield Finding(what, "note", "made by another version of its method's code than is here")
         system = None if result.reference else load_model(result, folder)
         found = evaluate_again(result, system)
         other = list(differences(result, found, tolerance))
@@ -191,18 +197,20 @@ def _again(result: Result, folder: Path) -> Iterator[Finding]:
             yield Finding(what, "ok", text)
         if system is None:
             return
-        if system.guarantee != result.guarantee:
-            yield Finding(
-                what,
-                "refused",
-                f"the model claims {system.guarantee}, its record {result.guarantee}",
-            )
+        said = result.guarantee
+        if said is None or system.guarantee.kind != said.kind:
+            text = f"the model claims {system.guarantee.kind!r}, its record {said and said.kind!r}"
+            yield Finding(what, "refused", text)
+        elif system.guarantee != said:
+            yield Finding(what, "note", "its class gives another reason for its guarantee by now")
         if "proved" in (system.guarantee.kind, getattr(result.guarantee, "kind", None)):
             for against in examine(system, result.environment, result.seed, found.metrics):
                 if isinstance(against, Contradiction):
                     yield Finding(what, "refused", f"claimed proved, but it {against}")
                 else:
                     yield Finding(what, "note", str(against))
+    except UnknownNameError as error:
+        yield Finding(what, "unchecked", str(error))
     except Exception as error:
         yield Finding(
             what, "refused", f"could not be scored again: {type(error).__name__}: {error}"

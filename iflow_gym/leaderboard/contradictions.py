@@ -107,7 +107,6 @@ def examine(
 def _moved(system: Method, task: Any) -> Iterator[Contradiction | Suspicion]:
     demos = task.demonstrations
     low, high = scored_box(demos)
-    diagonal = metrics.box_diagonal(low, high)
     starts, n_steps, dt = _grid(task)
     env = task.like(len(starts), horizon=n_steps)
     first, _ = env.reset(seed=0, options={"start": starts})
@@ -123,7 +122,7 @@ def _moved(system: Method, task: Any) -> Iterator[Contradiction | Suspicion]:
     if demos.goal is not None:
         still &= np.linalg.norm(ends - demos.attractor, axis=1) > tolerance
     if still.any():
-        yield from _followed_on(system, starts[still], ends[still], n_steps, dt, diagonal)
+        yield from _followed_on(system, starts[still], ends[still], n_steps, dt, task)
 
 
 def _grid(task: Any) -> tuple[FloatArray, int, float]:
@@ -164,34 +163,35 @@ def _followed_out(
 
 
 def _followed_on(
-    system: Method,
-    starts: FloatArray,
-    ends: FloatArray,
-    n_steps: int,
-    dt: float,
-    diagonal: float,
+    system: Method, starts: FloatArray, ends: FloatArray, n_steps: int, dt: float, task: Any
 ) -> Iterator[Contradiction | Suspicion]:
+    demos = task.demonstrations
+    box = scored_box(demos)
+    diagonal = metrics.box_diagonal(*box)
     chosen = np.unique(np.linspace(0, len(ends) - 1, min(FOLLOWED, len(ends))).astype(int))
     begun, at = starts[chosen], ends[chosen]
     n = REST_HORIZONS * n_steps
-    autonomous = isinstance(system, DynamicalSystem)
-    nudge = np.zeros_like(at)
-    if autonomous and system.period_ is not None:
-        nudge[:, 0] = NUDGE * diagonal
-    if autonomous:
-        paths = system.rollout(at + nudge, n, dt)  # type: ignore[attr-defined]
+    if isinstance(system, DynamicalSystem):
+        nudge = np.zeros_like(at)
+        if system.period_ is not None:
+            nudge[:, 0] = NUDGE * diagonal
+        paths = system.rollout(at + nudge, n, dt)
     else:  # its clock cannot be set: once more from the start
         paths = system.rollout(begun, n_steps + n, dt)[:, n_steps:]  # type: ignore[attr-defined]
     late = paths[:, n // 2 :]
     moved = np.linalg.norm(late - late[:, -1:], axis=2).max(axis=1)
-    for start, path, way in zip(begun, paths, moved, strict=True):
-        if way <= AT_REST * diagonal:
-            yield Contradiction("came to rest at another place", start, path[-1])
-    if (slow := moved > AT_REST * diagonal).any():
+    rests = moved <= AT_REST * diagonal
+    there = np.zeros(len(at), dtype=np.bool_)
+    if demos.goal is not None:
+        reached = np.linalg.norm(paths[:, -1] - demos.attractor, axis=1)
+        there = reached <= metrics.convergence_tolerance(*box)
+    for start, path in zip(begun[rests & ~there], paths[rests & ~there], strict=True):
+        yield Contradiction("came to rest elsewhere", start, path[-1])
+    if (moving := there | ~rests).any():
         yield Suspicion(
-            f"stood still in the environment, as from {_point(begun[slow][0])}, and moves on "
-            f"slowly: by {moved[slow].min() / diagonal:.1e} diagonals or more in the last "
-            f"{n // 2 * dt:.3g} s of {n * dt:.3g} s"
+            f"stood still in the environment, as from {_point(begun[moving][0])}, but moves on: "
+            f"of {len(at)} that were followed for {n * dt:.3g} s more, {there.sum()} are at the "
+            f"goal, {(moving & ~there).sum()} on their way"
         )
 
 
