@@ -56,8 +56,7 @@ def output_lock(folder: Path) -> Iterator[None]:
             "since": datetime.now(UTC).isoformat(timespec="seconds"),
         }
         with contextlib.suppress(OSError):  # a full disk: the lock holds without its text
-            file.write(json.dumps(holder) + "\n")
-            file.flush()
+            os.write(file.fileno(), (json.dumps(holder) + "\n").encode())
         try:
             yield
         finally:
