@@ -6,7 +6,10 @@ import dataclasses
 import io
 import json
 import math
+import re
+import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -23,6 +26,8 @@ from iflow_gym.leaderboard.compare import changes
 from iflow_gym.leaderboard.rescoring import ACROSS, SAME, differences_of_scores
 from iflow_gym.leaderboard.submission import SubmissionError, read_submission
 from iflow_gym.results import read_result, write_result
+
+ROOT = Path(__file__).parents[1]
 
 CLAIMS = '''
 """A toy motion, and four methods that claim a proof: one of them has it."""
@@ -408,16 +413,13 @@ def test_a_description_that_is_none_says_so(tmp_path):
 
 
 def test_every_committed_method_has_a_description_that_is_true():
-    from pathlib import Path
-
-    root = Path(__file__).parents[1]
-    folders = sorted(p for p in (root / "leaderboard" / "results").iterdir() if p.is_dir())
+    folders = sorted(p for p in (ROOT / "leaderboard" / "results").iterdir() if p.is_dir())
     assert folders
     for folder in folders:
         submission = read_submission(folder)
         assert submission.name == folder.name
         assert folder.name in METHODS | REFERENCES
-        assert (root / submission.code).exists()
+        assert (ROOT / submission.code).exists()
         record = read_result(next(folder.glob("*.json")))
         assert record.title == submission.title
         assert record.guarantee is None or record.guarantee.kind == submission.guarantee
@@ -457,3 +459,28 @@ def test_what_changed_is_told(results, tmp_path):
     assert "| rising | " in text
     assert "<b>" not in text
     assert changes(after, before).splitlines()[2] == "Gone: cells of bad, rising."
+
+
+def test_the_page_on_submissions_does_what_it_says(tmp_path):
+    """Its class of twenty lines, its commands and its description, from a folder of its own."""
+    page = (ROOT / "docs" / "submissions.md").read_text()
+    (source,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.M | re.S)
+    (description,) = re.findall(r"^```toml\n(.*?)^```$", page, flags=re.M | re.S)
+    assert len([line for line in source.splitlines() if line]) <= 20
+    (tmp_path / "straight.py").write_text(source)
+    ran, checked = re.findall(r"^python -m .*$", page, flags=re.M)
+    assert "'LASA-*'" in ran
+    ran = ran.replace("'LASA-*'", "LASA-Line-v0 --protocol reproduction --jobs 1")
+    for command_line in (ran, checked):
+        if command_line == checked:
+            (tmp_path / "results" / "straight" / "method.toml").write_text(description)
+        done = subprocess.run(
+            [sys.executable, *command_line.split()[1:]],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert done.stderr == ""
+    assert "scored again" in done.stdout
