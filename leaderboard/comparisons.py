@@ -20,7 +20,7 @@ from iflow_gym.statistics import (
 FEWEST_ENVIRONMENTS = 10
 """Below this the tests of ranks, which are asymptotic, are not made (Demšar 2006, sec. 3.2.2)."""
 
-N_THRESHOLDS = 120
+N_THRESHOLDS = 80
 """Points of a profile."""
 
 

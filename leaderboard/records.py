@@ -40,7 +40,6 @@ def details(board: Board, row: Row, length_unit: str) -> dict[str, Any]:
         "guarantees": guarantees_of(row),
         "missing": missing(row),
         "metrics": [heading(m.name, length_unit) for m in metrics],
-        "definitions": [m.definition for m in metrics],
         "scores": scores,
     }
 

@@ -18,7 +18,7 @@ from board import HOLDS, MAIN, RANKED, Board, Row
 from classes import confusion, fraction_right
 from comparisons import FEWEST_ENVIRONMENTS, compared, improvements, rank_comparison
 from drawings import Drawing, first_cell, number_figures
-from inline import data_address, inline_svg, panel_pictures, webp
+from inline import Styles, inline_svg, moving_webp, panel_pictures, webp
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
@@ -142,6 +142,7 @@ def render(
         page has no pictures at all, and is quick to make.
     """
     pictures = bool(figures) or not drawings
+    styles = Styles()
     data: dict[str, dict[str, Any]] = {}
     families: dict[str, list[dict[str, Any]]] = {}
     for board in boards:
@@ -149,7 +150,7 @@ def render(
         key = identifier(f"{board.family}-{board.protocol}")
         data[key] = {row.method: details(board, row, unit) for row in board.rows}
         families.setdefault(board.family, []).append(
-            board_context(board, unit, key, drawings, figures, pictures=pictures)
+            board_context(board, unit, key, drawings, figures, styles if pictures else None)
         )
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
@@ -181,6 +182,7 @@ def render(
         n_records=len(results),
         palette=range(len(PALETTE)),
         style=Markup((TEMPLATES / "page.css").read_text(encoding="utf-8")),
+        figure_style=Markup(styles.css()),
         script=Markup((TEMPLATES / "page.js").read_text(encoding="utf-8")),
     )
     return "\n".join(line.rstrip() for line in text.splitlines() if line.strip()) + "\n"
@@ -188,6 +190,7 @@ def render(
 
 def without_pictures(page: str) -> str:
     """Return a page's text without its figures and pictures, which differ between machines."""
+    page = re.sub(r'<style id="figure-style">.*?</style>\n?', "", page, flags=re.S)
     return re.sub(r"<figure.*?</figure>\n?", "", page, flags=re.S)
 
 
@@ -253,10 +256,9 @@ def board_context(
     key: str,
     drawings: Mapping[str, Drawing],
     figures: Mapping[str, Figure],
-    *,
-    pictures: bool,
+    styles: Styles | None,
 ) -> dict[str, Any]:
-    """Return what the template says of a board."""
+    """Return what the template says of a board; without styles, all but figures and pictures."""
     found = aggregates(board)
     columns = columns_of(board, found, unit)
     return {
@@ -273,12 +275,12 @@ def board_context(
         "n_columns": len(columns) + 4,
         "footnote": plain(footnote(board, found)),
         "outside": outside(board),
-        "figures": number_pictures(board, key) if pictures else [],
-        "ranks": rank_context(board, key, pictures=pictures),
+        "figures": [] if styles is None else number_pictures(board, styles),
+        "ranks": rank_context(board, styles),
         "improvements": improvement_context(board),
         "confusions": confusions(board),
         "galleries": galleries(board, drawings, figures, unit),
-        "animation": animation() if pictures and board.motion == "drumming" else None,
+        "animation": animation() if styles is not None and board.motion == "drumming" else None,
     }
 
 
@@ -398,10 +400,15 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
     beside = ""
     if len(order) > 1:
         second = order[1]
-        beside = f"Next: {second.title}, {entries[second.method].text} {bracket}".rstrip() + "."
+        beside = f"Next: {second.title}, {entries[second.method].text} {bracket}".rstrip()
         chance = improvements(board).get((first.method, second.method))
         if chance is not None and chance.n_environments > 1:
-            beside += f" It does better with {100 * chance.probability:.0f} % probability."
+            beside += f", worse with {100 * chance.probability:.0f} % probability"
+        beside += "."
+    leading = board.best(board.mean_rank, "mean_rank")
+    if leading and first.method not in leading:
+        titles = " and ".join(row.title for row in board.competitors if row.method in leading)
+        beside += f" Best mean rank over all metrics of accuracy: {titles}."
     result = [
         {"label": "Most accurate", "value": first.title, "text": text, "beside": beside},
         proved_card(board, found),
@@ -455,7 +462,7 @@ def _full(board: Board, row: Row) -> bool:
 # Figures ------------------------------------------------------------------------------------
 
 
-def number_pictures(board: Board, key: str) -> list[dict[str, Any]]:
+def number_pictures(board: Board, styles: Styles) -> list[dict[str, Any]]:
     """Return a board's figures of numbers, in the page's colours."""
     makers = number_figures(board)
     lower = get_metric(MAIN[board.motion]).better == "lower"
@@ -467,7 +474,9 @@ def number_pictures(board: Board, key: str) -> list[dict[str, Any]]:
         {
             "title": title,
             "caption": caption.format(**words),
-            "svg": Markup(inline_svg(makers[name](), f"{key}-{name}", f"{title}, {board.family}")),
+            "svg": Markup(
+                inline_svg(makers[name](), f"{title}, {board.family}, {board.protocol}", styles)
+            ),
             "wide": name == "boxes",
         }
         for name, (title, caption) in FIGURES.items()
@@ -475,12 +484,14 @@ def number_pictures(board: Board, key: str) -> list[dict[str, Any]]:
     ]
 
 
-def rank_context(board: Board, key: str, *, pictures: bool) -> dict[str, Any] | None:
+def rank_context(board: Board, styles: Styles | None) -> dict[str, Any] | None:
     """Return the tests of ranks and their figure."""
     comparison = rank_comparison(board)
     if comparison is None:
         return None
-    svg = inline_svg(number_figures(board)["ranks"](), f"{key}-ranks", "Mean ranks") if pictures else ""
+    svg = ""
+    if styles is not None:
+        svg = inline_svg(number_figures(board)["ranks"](), "Mean ranks", styles)
     return {
         "words": plain(ranks_in_words(comparison)),
         "caption": CAPTIONS["ranks"],
@@ -594,7 +605,7 @@ def animation() -> dict[str, Any] | None:
         size = image.size
         still = webp(np.asarray(image.convert("RGB")))
     return {
-        "moving": data_address(ANIMATION.read_bytes(), "image/gif"),
+        "moving": moving_webp(ANIMATION),
         "still": still,
         "width": size[0],
         "height": size[1],

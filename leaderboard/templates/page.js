@@ -237,9 +237,7 @@
     const table = element("table");
     const head = table.createTHead().insertRow();
     head.append(element("th", "Motion", { scope: "col" }));
-    known.metrics.forEach((title, i) => {
-      head.append(element("th", title, { scope: "col", title: known.definitions[i] }));
-    });
+    for (const title of known.metrics) head.append(element("th", title, { scope: "col" }));
     const body = table.createTBody();
     for (const [name, ...cells] of known.scores) {
       const line = body.insertRow();
