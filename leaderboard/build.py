@@ -24,7 +24,7 @@ from pathlib import Path
 
 import web
 from board import Board, make_boards
-from drawings import Drawing, drawings, units_of
+from drawings import Drawing, drawings_of, units_of
 from matplotlib.figure import Figure
 from page import render
 
@@ -88,7 +88,7 @@ def plan(results_folder: Path) -> Plan:
             f"--output {results_folder}` first."
         )
     boards = make_boards(results)
-    return Plan(results, boards, units_of(boards), drawings(boards, results_folder))
+    return Plan(results, boards, units_of(boards), drawings_of(boards, results_folder))
 
 
 def build(results_folder: Path, output: Path) -> list[Path]:

@@ -78,7 +78,7 @@ class Drawing:
     """Of a sheet's panels."""
 
 
-def drawings(boards: Iterable[Board], results_folder: Path) -> dict[str, Drawing]:
+def drawings_of(boards: Iterable[Board], results_folder: Path) -> dict[str, Drawing]:
     """Return the figures beside LEADERBOARD.md by the names of their files."""
     by_key = {(board.family, board.protocol): board for board in boards}
     found: dict[str, Drawing] = {}
@@ -131,9 +131,7 @@ def sheets(by_key: Mapping[tuple[str, str], Board], results_folder: Path) -> dic
     return found
 
 
-def draw_sheet(
-    specs: Sequence[Spec], results_folder: Path, n_columns: int, size: float
-) -> Figure:
+def draw_sheet(specs: Sequence[Spec], results_folder: Path, n_columns: int, size: float) -> Figure:
     """Return a sheet, its axes in the order of the specs."""
     panels = [panel_of(spec, results_folder) for spec in specs]
     return field_sheet(panels, n_columns=n_columns, size=size)
@@ -287,7 +285,7 @@ def reference_median(board: Board, metric: str) -> float | None:
 
 
 def accuracy_stability(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
-    """The main accuracy against the share of starts that end where they should."""
+    """Draw the main accuracy against the share of starts that end where they should."""
     metric, holds = MAIN[board.motion], HOLDS[board.motion]
     points = []
     for row in _drawn(board, styles):

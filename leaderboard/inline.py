@@ -143,7 +143,7 @@ def panel_pictures(figure: Figure, n: int) -> list[str]:
     for ax in figure.axes[:n]:
         box = ax.get_window_extent()
         left, right = int(np.floor(box.x0)), int(np.ceil(box.x1))
-        top, bottom = (int(round(len(pixels) - y)) for y in (box.y1, box.y0))
+        top, bottom = (round(len(pixels) - y) for y in (box.y1, box.y0))
         picture = Image.fromarray(pixels[max(top, 0) : bottom, max(left, 0) : right])
         picture.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
         pictures.append(webp(np.asarray(picture)))

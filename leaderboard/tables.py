@@ -187,9 +187,7 @@ def statistic_of(metric: str) -> str:
     return "mean" if metric in BY_MEAN else "iqm"
 
 
-def entries_of(
-    board: Board, found: Aggregates, metric: str, statistic: str
-) -> dict[str, Entry]:
+def entries_of(board: Board, found: Aggregates, metric: str, statistic: str) -> dict[str, Entry]:
     """Return a column by method; what is shown alike with the best is best, too."""
     values = {
         row.method: float(getattr(aggregate, statistic))

@@ -289,7 +289,8 @@ def columns_of(board: Board, found: Aggregates, unit: str) -> list[dict[str, Any
     first = SHOWN_FIRST[board.motion]
     columns = []
     names = [m.name for m in metrics_of(board.motion)]
-    names.sort(key=lambda n: (list(GROUPS).index(get_metric(n).family), n not in first))
+    places = {name: place for place, name in enumerate(first)}
+    names.sort(key=lambda n: (list(GROUPS).index(get_metric(n).family), places.get(n, len(first))))
     for name in names:
         if not any(found[row.method, name] is not None for row in board.rows):
             continue
@@ -376,7 +377,7 @@ def sortable(value: float) -> str:
     """Return a number for the script to sort by; nothing for nan."""
     if math.isnan(value):
         return ""
-    return repr(value) if math.isinf(value) else f"{value:.8g}"
+    return f"{value:.8g}".replace("inf", "Infinity")
 
 
 def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
@@ -439,11 +440,11 @@ def proved_card(board: Board, found: Aggregates) -> dict[str, str]:
     converge = "converged" if holds == "converged" else "were attracted"
     text = f"Proved, and all starts {converge}." if whole else ""
     if rest:
-        text += " Proved, yet within the horizon " + "; ".join(
-            f"{row.title}: {percent(a.mean)} % {converge}"
+        text += " Also proved, but within the horizon fewer " + converge + ": " + ", ".join(
+            f"{row.title} {percent(a.mean)} %"
             for row in rest
             if (a := measured[row.method]) is not None
-        ) + "."
+        ) + "."  # fmt: skip
     value = ", ".join(row.title for row in whole or rest) or "no method"
     return {
         "label": "Stable for sure",

@@ -121,7 +121,7 @@
       const group = body.querySelector("tr.group");
       if (group) group.hidden = !body.querySelector("tr.row:not([hidden])");
     }
-    table.closest(".board").querySelector(".none").hidden = n > 0;
+    table.closest(".board").querySelector(".empty").hidden = n > 0;
   }
 
   function sort(table) {
@@ -263,20 +263,26 @@
 
   // Why a guarantee is what it is.
   const reason = document.getElementById("reason");
+  let asked = null;
   function explain(badge) {
     reason.textContent = `${badge.textContent}: ${badge.dataset.reason}`;
     if (!reason.showPopover) {
       alert(reason.textContent);
       return;
     }
+    asked = badge;
     reason.showPopover({ source: badge });
-    const box = badge.getBoundingClientRect();
+    place();
+  }
+  function place() {
+    if (!asked || !reason.matches(":popover-open")) return;
+    const box = asked.getBoundingClientRect();
     const left = Math.max(8, Math.min(box.left, innerWidth - reason.offsetWidth - 8));
     const below = box.bottom + 6 + reason.offsetHeight < innerHeight;
     reason.style.left = `${left}px`;
     reason.style.top = `${below ? box.bottom + 6 : Math.max(8, box.top - 6 - reason.offsetHeight)}px`;
   }
-  addEventListener("scroll", () => reason.matches(":popover-open") && reason.hidePopover(), true);
+  addEventListener("scroll", place, true);
 
   for (const play of document.querySelectorAll(".play")) {
     const image = play.closest("figure").querySelector("img");
