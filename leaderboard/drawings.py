@@ -16,7 +16,7 @@ from classes import confusion
 from comparisons import compared, is_logarithmic, profiles, rank_comparison
 from matplotlib.figure import Figure
 from page import HEADLINE
-from tables import heading, shape_name
+from tables import PERCENT, heading, shape_name
 
 import iflow_gym  # noqa: F401 (registers the environments)
 from iflow_gym.baselines.registry import METHODS, load_method
@@ -340,13 +340,13 @@ def boxes(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
     """Four metrics, a box over the shapes for each method."""
     metrics = BOXES[board.motion]
     references = {
-        heading(metric, unit): value
+        heading(metric, unit): _scale(metric) * value
         for metric in metrics
         if (value := reference_median(board, metric)) is not None
     }
     panels = {
         heading(metric, unit): {
-            row.method: np.array([v for v, ran in _tried(row, metric) if ran])
+            row.method: _scale(metric) * np.array([v for v, ran in _tried(row, metric) if ran])
             for row in _drawn(board, styles)
             if row.applies(metric)  # what has no field has no box for it, and has not failed
         }
@@ -355,6 +355,11 @@ def boxes(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
     return box_figure(
         panels, styles, references, reference_label="between demonstrations (median over shapes)"
     )
+
+
+def _scale(metric: str) -> float:
+    """Return what a metric is multiplied by to be shown: fractions are in percent."""
+    return 100.0 if metric in PERCENT else 1.0
 
 
 def profile(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:

@@ -440,12 +440,14 @@ def proved_card(board: Board, found: Aggregates) -> dict[str, str]:
     converge = "converged" if holds == "converged" else "were attracted"
     text = f"Proved, and all starts {converge}." if whole else ""
     if rest:
-        text += " Also proved, but within the horizon fewer " + converge + ": " + ", ".join(
+        shares = ", ".join(
             f"{row.title} {percent(a.mean)} %"
             for row in rest
             if (a := measured[row.method]) is not None
-        ) + "."  # fmt: skip
-    value = ", ".join(row.title for row in whole or rest) or "no method"
+        )
+        begin = " Also proved" if whole else "Proved"
+        text += f"{begin}, but not all starts {converge} within the horizon: {shares}."
+    value = ", ".join(row.title for row in whole) or "No method without exception"
     return {
         "label": "Stable for sure",
         "value": value,

@@ -198,9 +198,16 @@
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
     return made;
   }
-  function list(pairs) {
-    const made = element("dl", undefined, { class: "facts" });
-    for (const [term, text] of pairs) made.append(element("dt", term), element("dd", text));
+  function list(pairs, many = false) {
+    const made = element("dl", undefined, { class: many ? "facts many" : "facts" });
+    for (const [term, text] of pairs) {
+      const pair = [element("dt", term), element("dd", text)];
+      if (many) {
+        const together = element("div");
+        together.append(...pair);
+        made.append(together);
+      } else made.append(...pair);
+    }
     return made;
   }
   function toggle(row) {
@@ -227,7 +234,7 @@
     made.append(element("h4", "Cells without scores"));
     if (known.missing.length) made.append(list(known.missing));
     else made.append(element("p", "None: every cell has scores."));
-    if (known.settings.length) made.append(element("h4", "Settings"), list(known.settings));
+    if (known.settings.length) made.append(element("h4", "Settings"), list(known.settings, true));
     made.append(element("h4", "Every motion"));
     made.append(element("p",
       "Means over the seeds. Below: 95 % bootstrap interval over the demonstrations; of what has " +
