@@ -66,10 +66,10 @@ def rank_figure(comparison: RankComparison, styles: Sequence[MethodStyle]) -> Fi
         ax.plot([ranks[i]] * 2 + [side], [0, height, height], color=style.colour, linewidth=1.3)
         ax.plot([ranks[i]], [0], style.marker, color=style.colour, markersize=6.5, zorder=4,
                 markeredgecolor="white", markeredgewidth=0.7)  # fmt: skip
-        rank = f"{ranks[i]:.2f}"
+        mean = f"{ranks[i]:.2f}"
         ax.text(
             side + (-0.03 if left else 0.03) * reach, height,
-            f"{style.title} {rank}" if left else f"{rank} {style.title}",
+            f"{style.title} {mean}" if left else f"{mean} {style.title}",
             ha="right" if left else "left", va="center", fontsize=9.5, color=INK,
         )  # fmt: skip
     return figure

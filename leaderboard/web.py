@@ -191,7 +191,7 @@ def render(
 def without_pictures(page: str) -> str:
     """Return a page's text without its figures and pictures, which differ between machines."""
     page = re.sub(r'<style id="figure-style">.*?</style>\n?', "", page, flags=re.S)
-    return re.sub(r"<figure.*?</figure>\n?", "", page, flags=re.S)
+    return re.sub(r" *<figure.*?</figure>\n?", "", page, flags=re.S)
 
 
 def as_script_data(value: Any) -> str:
