@@ -33,6 +33,9 @@ def make_agent(settings: TrainingSettings, env: Any, seed: int, tensorboard: Pat
         size = env.action_space.shape[0]
         noise = NormalActionNoise(np.zeros(size), np.full(size, settings.action_noise))
         keywords["action_noise"] = VectorizedActionNoise(noise, env.num_envs)
+    if settings.decay and "learning_rate" in keywords:
+        rate = float(keywords["learning_rate"])
+        keywords["learning_rate"] = lambda remaining: rate * remaining
     return kinds[settings.algorithm](
         "MlpPolicy",
         env,

@@ -34,6 +34,8 @@ class TrainingSettings:
     """Largest residual in greatest speeds."""
     scratch_scale: float = 0.4
     """The same where there is no base: twice the peak speed of recordings in the plane."""
+    decay: bool = True
+    """Whether the learning rate falls linearly to 0 over the run, so that it ends at rest."""
     action_noise: float = 0.0
     """Standard deviation of the noise of TD3's exploration, in largest residuals."""
     n_evaluations: int = 10
