@@ -34,6 +34,9 @@ class TrainingSettings:
     """Largest residual in greatest speeds."""
     scratch_scale: float = 0.4
     """The same where there is no base: twice the peak speed of recordings in the plane."""
+    reward_scale: float = 1.0
+    """What rewards are multiplied by for the agent. With 1 - gamma the values that it learns are of
+    order 1, and do not drown the policy's gradient where both are clipped together."""
     decay: bool = True
     """Whether the learning rate falls linearly to 0 over the run, so that it ends at rest."""
     action_noise: float = 0.0

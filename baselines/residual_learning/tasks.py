@@ -30,11 +30,16 @@ def batch_of(env_id: str, num_envs: int, **arguments: Any) -> VectorEnv[Any, Any
 
 
 def residual_vec_env(
-    env_id: str, num_envs: int, base_policy: Any, scale: float, stable: bool | float
+    env_id: str,
+    num_envs: int,
+    base_policy: Any,
+    scale: float,
+    stable: bool | float,
+    reward_scale: float = 1.0,
 ) -> ArrayVecEnv:
     """Return what Stable-Baselines3 trains in."""
     batch = batch_of(env_id, num_envs)
-    return ArrayVecEnv(ResidualVectorWrapper(batch, base_policy, scale, stable=stable))
+    return ArrayVecEnv(ResidualVectorWrapper(batch, base_policy, scale, stable=stable), reward_scale)
 
 
 def returns_of(

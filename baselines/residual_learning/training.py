@@ -157,7 +157,14 @@ def _learn(
     one_thread()
     settings = settings_of(card)
     base = load_base(folder, card)
-    env = residual_vec_env(card.environment, settings.num_envs, base, card.scale, card.shield)
+    env = residual_vec_env(
+        card.environment,
+        settings.num_envs,
+        base,
+        card.scale,
+        card.shield,
+        settings.reward_scale,
+    )
     curves = folder / "tensorboard" if tensorboard else None
     agent = make_agent(settings, env, card.seed + card.steps, curves)
     if start is not None:

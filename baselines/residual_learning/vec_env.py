@@ -24,6 +24,13 @@ class ArrayVecEnv(VecEnv):  # type: ignore[misc]
     `SyncVectorEnv` and `AsyncVectorEnv` with ``autoreset_mode=AutoresetMode.DISABLED``.
     Observations are float32.
 
+    Parameters
+    ----------
+    env : VectorEnv
+    reward_scale : float
+        What rewards are multiplied by for the agent; the episodes' statistics are of those that the
+        environment gave.
+
     Attributes
     ----------
     cpu_seconds, wall_seconds : float
@@ -32,7 +39,7 @@ class ArrayVecEnv(VecEnv):  # type: ignore[misc]
         Steps of single environments so far.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], reward_scale: float = 1.0) -> None:
         if not isinstance(env, VectorEnv):
             raise TypeError(f"Expected a gymnasium VectorEnv, got {type(env).__name__}.")
         mode = env.metadata.get("autoreset_mode")
@@ -44,6 +51,7 @@ class ArrayVecEnv(VecEnv):  # type: ignore[misc]
                 "with vector_kwargs={'autoreset_mode': AutoresetMode.DISABLED}."
             )
         self.env = env
+        self._scale = reward_scale
         self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: Any = None
@@ -95,7 +103,7 @@ class ArrayVecEnv(VecEnv):  # type: ignore[misc]
                 last = np.where(done[:, None], np.asarray(first, dtype=np.float32), last)
                 self._returns[done] = 0
                 self._lengths[done] = 0
-        return last, np.asarray(rewards, dtype=np.float32), done, infos
+        return last, np.asarray(self._scale * rewards, dtype=np.float32), done, infos
 
     def _timed(self) -> _Clock:
         return _Clock(self)
