@@ -1,4 +1,4 @@
-"""Train a residual on top of a learned motion by reinforcement learning, with Stable-Baselines3.
+r"""Train a residual on top of a learned motion by reinforcement learning, with Stable-Baselines3.
 
 The agent sees the environment's observation and the base's command, and adds a velocity to it.
 With --stable the sum is projected so that the base's Lyapunov function falls whatever the agent
@@ -273,7 +273,7 @@ def main() -> None:
     import tyro
     from rich.console import Console
 
-    command: Any = tyro.cli(Command, description=__doc__)  # type: ignore[arg-type]
+    command: Any = tyro.cli(Command, description=__doc__)
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # for --base-method my_module:MyMethod
     try:

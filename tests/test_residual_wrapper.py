@@ -53,9 +53,10 @@ def test_without_a_residual_it_is_the_base_bit_for_bit(env_id, settings, bases):
         assert ours == reward
         np.testing.assert_array_equal(told["command"], told["base_command"])
         np.testing.assert_array_equal(wrapped._observation, observation)
-        assert told["distance_to_goal" if base.period_ is None else "phase"] == info[
-            "distance_to_goal" if base.period_ is None else "phase"
-        ]
+        assert (
+            told["distance_to_goal" if base.period_ is None else "phase"]
+            == info["distance_to_goal" if base.period_ is None else "phase"]
+        )
 
 
 @every_case

@@ -48,7 +48,7 @@ class FlowLyapunov:
         # Row j of what is reshaped is column j of J_h: it is the transpose already.
         transposed = columns.reshape(n, d, d) @ self._frame.T
         gradient = np.linalg.solve(transposed, self._latent_gradient(z)[:, :, None])[:, :, 0]
-        return self._latent.lyapunov(z), gradient
+        return self._latent.lyapunov(z), np.asarray(gradient, dtype=np.float64)
 
     def _latent_gradient(self, z: FloatArray) -> FloatArray:
         if not isinstance(self._latent, CycleField):

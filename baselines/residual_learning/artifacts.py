@@ -1,11 +1,11 @@
 """What a training run leaves in its folder, read back with checks.
 
-    agent.zip           the agent, in Stable-Baselines3's own format
-    base.safetensors    the base model, as its `save` writes it; none for learning from scratch
-    card.json           what belongs together: environment, demonstrations, base, settings, versions
-    checkpoints/        agents on the way, named by their steps
-    tensorboard/        the curves
-    evaluations.json    mean rewards on the way
+agent.zip           the agent, in Stable-Baselines3's own format
+base.safetensors    the base model, as its `save` writes it; none for learning from scratch
+card.json           what belongs together: environment, demonstrations, base, settings, versions
+checkpoints/        agents on the way, named by their steps
+tensorboard/        the curves
+evaluations.json    mean rewards on the way
 """
 
 from __future__ import annotations

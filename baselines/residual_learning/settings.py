@@ -39,6 +39,10 @@ class TrainingSettings:
     order 1, and do not drown the policy's gradient where both are clipped together."""
     decay: bool = True
     """Whether the learning rate falls linearly to 0 over the run, so that it ends at rest."""
+    last_log_std: float | None = None
+    """For PPO: the logarithm of the exploration's standard deviation falls linearly to this over
+    the run, in place of being learned. A projection takes off what of the noise leads outward, so
+    that noise alone carries inward; what an agent leaves to it is missing when it acts without."""
     action_noise: float = 0.0
     """Standard deviation of the noise of TD3's exploration, in largest residuals."""
     n_evaluations: int = 10

@@ -39,7 +39,9 @@ def residual_vec_env(
 ) -> ArrayVecEnv:
     """Return what Stable-Baselines3 trains in."""
     batch = batch_of(env_id, num_envs)
-    return ArrayVecEnv(ResidualVectorWrapper(batch, base_policy, scale, stable=stable), reward_scale)
+    return ArrayVecEnv(
+        ResidualVectorWrapper(batch, base_policy, scale, stable=stable), reward_scale
+    )
 
 
 def returns_of(
@@ -64,7 +66,7 @@ def returns_of(
         actions, _ = agent.predict(observations, deterministic=True)
         observations, rewards, _, _, _ = envs.step(actions)
         sums += np.where(k < lengths, rewards, 0.0)
-    return sums / lengths
+    return np.asarray(sums / lengths)
 
 
 def _episode(agent: Any, env: Any, index: int) -> float:

@@ -13,12 +13,15 @@ from typing import Any
 import gymnasium
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
 
-from iflow_gym.baselines.registry import load_method
-from iflow_gym.baselines.residual_learning.agents import make_agent, one_thread, set_parameters
+from iflow_gym.baselines.residual_learning.agents import (
+    AgentFileError,
+    make_agent,
+    one_thread,
+    set_parameters,
+)
 from iflow_gym.baselines.residual_learning.artifacts import (
     AGENT,
     BASE,
-    AgentFileError,
     Card,
     load_base,
     read_card,
@@ -174,11 +177,16 @@ def _learn(
     evaluate = EvaluateCallback(
         folder, card, base, max(1, total // settings.n_evaluations), keep=start is not None
     )
+    annealing = []
+    if settings.algorithm == "ppo" and settings.last_log_std is not None:
+        first = float(settings.policy.get("log_std_init", 0.0))
+        annealing = [AnnealExploration(first, settings.last_log_std, total)]
     callbacks = CallbackList(
         [
             evaluate,
             CheckpointCallback(every, str(folder / "checkpoints"), name_prefix="agent"),
             EnvironmentShare(env),
+            *annealing,
         ]
     )
     cpu, wall = time.process_time(), time.perf_counter()
@@ -199,7 +207,7 @@ def _learn(
     return Trained(folder, card, cpu, wall, env.cpu_seconds / cpu)
 
 
-class EvaluateCallback(BaseCallback):  # type: ignore[misc]
+class EvaluateCallback(BaseCallback):
     """Measures the mean reward a step from every recording's start, now and then.
 
     `evaluations.json` has a line for each: steps and the mean over the recordings.
@@ -226,16 +234,32 @@ class EvaluateCallback(BaseCallback):  # type: ignore[misc]
         """Evaluate now."""
         card = self._card
         assert self.model is not None
-        returns = returns_of(
-            self.model, card.environment, self._base, card.scale, card.shield
-        )
+        returns = returns_of(self.model, card.environment, self._base, card.scale, card.shield)
         mean = float(returns.mean())
         self.found.append({"steps": int(self.model.num_timesteps), "mean_reward": mean})
         self._path.write_text(json.dumps(self.found, indent=1) + "\n", encoding="utf-8")
         self.logger.record("eval/mean_reward_a_step", mean)
 
 
-class EnvironmentShare(BaseCallback):  # type: ignore[misc]
+class AnnealExploration(BaseCallback):
+    """Lets the logarithm of PPO's standard deviation go linearly from one number to another."""
+
+    def __init__(self, first: float, last: float, total: int) -> None:
+        super().__init__()
+        self._first, self._last, self._total = first, last, total
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        assert self.model is not None
+        done = min(self.model.num_timesteps / self._total, 1.0)
+        spread: Any = self.model.policy.log_std
+        spread.requires_grad_(False)
+        spread.fill_((1 - done) * self._first + done * self._last)
+
+
+class EnvironmentShare(BaseCallback):
     """Logs the share of the time that the environment takes."""
 
     def __init__(self, env: ArrayVecEnv) -> None:
@@ -251,8 +275,3 @@ class EnvironmentShare(BaseCallback):  # type: ignore[misc]
     def _on_rollout_end(self) -> None:
         share = self._env.cpu_seconds / max(time.process_time() - self._began, 1e-9)
         self.logger.record("time/environment_share", share)
-
-
-def base_title(name: str) -> str:
-    """Return a method's name as people write it."""
-    return load_method(name).title

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 
-class ArrayVecEnv(VecEnv):  # type: ignore[misc]
+class ArrayVecEnv(VecEnv):
     """A vector environment whose `reset` takes a mask, for Stable-Baselines3.
 
     Of iflow_gym those made with ``vectorization_mode="vector_entry_point"`` do, and Gymnasium's

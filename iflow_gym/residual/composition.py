@@ -55,7 +55,7 @@ class Composition:
         self.task = task
         self.n_dims: int = task.n_dims
         self.base = base_of(base_policy, task)
-        self.largest = float(scale) * task.max_speed
+        self.largest = float(scale) * float(task.max_speed)
         self.shield: LyapunovShield | None = None
         if stable is not False:
             share = RATE_SHARE if stable is True else float(stable)
@@ -88,7 +88,7 @@ class Composition:
         seen = np.concatenate(
             [(observations - self._centre) / self._half, command / self._peak], axis=-1
         ).astype(np.float32)
-        return np.clip(seen, self.observation_space.low, self.observation_space.high)
+        return np.asarray(np.clip(seen, self.observation_space.low, self.observation_space.high))
 
     def positions(self, features: FloatArray) -> FloatArray:
         """Return the positions, shape (n, d), that features show."""
@@ -102,7 +102,7 @@ class Composition:
         added = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0) * self.largest
         if self.shield is not None:
             added = self.shield.kept(observations[:, : self.n_dims], command, added, dt)
-        return command + added
+        return np.asarray(command + added)
 
     def checked(self, actions: Any, shape: tuple[int, ...]) -> FloatArray:
         """Return the agent's actions as float64; raise ValueError unless finite and of a shape."""

@@ -110,7 +110,9 @@ class LyapunovShield:
         self.rate_share = float(rate_share)
         self.rate = self.rate_share * lyapunov.decay
 
-    def kept(self, x: FloatArray, command: FloatArray, added: FloatArray, dt: FloatArray) -> FloatArray:
+    def kept(
+        self, x: FloatArray, command: FloatArray, added: FloatArray, dt: FloatArray
+    ) -> FloatArray:
         """Return what is kept of an addition to a command, shape (n, d) in length/s.
 
         Parameters

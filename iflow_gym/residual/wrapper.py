@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Space
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -58,7 +59,7 @@ class ResidualActionWrapper(gymnasium.Wrapper[Features, FloatArray, FloatArray, 
 
     def __init__(
         self,
-        env: gymnasium.Env[FloatArray, FloatArray],
+        env: Any,
         base_policy: Any,
         scale: float = SCALE,
         *,
@@ -66,14 +67,18 @@ class ResidualActionWrapper(gymnasium.Wrapper[Features, FloatArray, FloatArray, 
     ) -> None:
         super().__init__(env)
         self.composition = Composition(_task_of(env), base_policy, scale, stable)
-        self.action_space = self.composition.action_space
-        self.observation_space = self.composition.observation_space
+        self.action_space = cast("Space[Any]", self.composition.action_space)
+        self.observation_space = cast("Space[Any]", self.composition.observation_space)
         self._observation: FloatArray | None = None
+        self._command: FloatArray = np.zeros((1, self.composition.n_dims))
+        self._dt: FloatArray = np.zeros(1)
+        self._memory: Any = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Features, dict[str, Any]]:
         """Begin an episode; options are the environment's."""
+        observation: Any
         observation, info = self.env.reset(seed=seed, options=options)
         self._memory = None
         seen = self._see(observation, info, begun=True)
@@ -89,8 +94,9 @@ class ResidualActionWrapper(gymnasium.Wrapper[Features, FloatArray, FloatArray, 
         base, state, dt = self._command, self._observation, self._dt
         command = self.composition.commanded(state[None], base, added[None], dt)
         own = self.composition.task.command_to_action(command[0], state, float(dt[0]))
-        observation, reward, terminated, truncated, info = self.env.step(own)
-        seen = self._see(observation, info, begun=False)
+        following: Any
+        following, reward, terminated, truncated, info = self.env.step(own)
+        seen = self._see(following, info, begun=False)
         info = {**info, **_commands(base[0], command[0])}
         return seen, reward, terminated, truncated, info
 
@@ -101,7 +107,8 @@ class ResidualActionWrapper(gymnasium.Wrapper[Features, FloatArray, FloatArray, 
         self._command, self._memory = self.composition.base.command(
             states, self._dt, self._memory, starts_of(1, begun)
         )
-        return self.composition.features(states, self._command)[0]
+        seen: Features = self.composition.features(states, self._command)[0]
+        return seen
 
 
 class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray, NDArray[Any]]):
@@ -135,10 +142,12 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
         self._ended = starts_of(self.num_envs, False)
         self._observation: FloatArray | None = None
+        self._command: FloatArray = np.zeros((self.num_envs, self.composition.n_dims))
+        self._dt: FloatArray = np.zeros(self.num_envs)
         self._memory: Any = None
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Features, dict[str, Any]]:
         """Begin episodes; options are the environment's, ``reset_mask`` among them."""
         mask = (options or {}).get("reset_mask")
@@ -155,9 +164,10 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
         else:  # the clocks of those that go on have been asked for this step already
             kept, memory = self._command, self._memory
             seen = self._see(observations, begun)
-            self._command = np.where(begun[:, None], self._command, kept)
+            self._command = np.asarray(np.where(begun[:, None], self._command, kept))
             self._memory = _merged(memory, self._memory, begun)
-            seen = self.composition.features(self._observation, self._command)
+            states = np.asarray(observations, dtype=np.float64)
+            seen = self.composition.features(states, self._command)
         return seen, {**info, **_commands(self._command, self._command, begun)}
 
     def step(
