@@ -13,6 +13,7 @@ import numpy as np
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
 from iflow_gym.datasets.letters import LETTERS
 from iflow_gym.demonstrations import PROTOCOLS
+from iflow_gym.envs.disturbed import DisturbedEnv, DisturbedLASAEnv, Wind
 from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.recorded import DrummingRecordedEnv
 from iflow_gym.envs.lasa import LASAEnv
@@ -23,6 +24,7 @@ from iflow_gym.registration import (
     DRUMMING_ID,
     DRUMMING_RECORDED_ID,
     POINT_MASS_ID,
+    disturbed_id,
     lasa_id,
     letter_id,
 )
@@ -89,6 +91,19 @@ The batched version steps all at once in NumPy and gives the bits that the singl
 ## Ids
 
 {letters}
+
+# `iflow/Disturbed-<Shape>-v0`
+
+{inspect.getdoc(DisturbedLASAEnv)} One for every shape above, such as
+`{disturbed_id("Angle")}`; with your own recordings
+`iflow_gym.envs.disturbed.DisturbedEnv(demonstrations)`. [Residuals on a learned
+motion](residual.md) are what it is for.
+
+{inspect.getdoc(DisturbedEnv)}
+
+## Wind
+
+{inspect.getdoc(Wind)}
 """
 
 

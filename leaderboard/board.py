@@ -160,6 +160,24 @@ class Row:
             )
         return self._aggregates[metric]
 
+    def reward(self) -> Aggregate | None:
+        """Return the mean reward a step over all cells; None unless every scored cell has one."""
+        cells = [cell for cell in self.cells.values() if cell.ok]
+        if not cells or not all("mean" in cell.returns for cell in cells):
+            return None
+        found = {
+            environment: np.array(
+                [
+                    cell.returns["mean"]
+                    if (cell := self.cells.get((environment, seed)))
+                    else np.nan
+                    for seed in self.seeds
+                ]
+            )
+            for environment in self.environments
+        }
+        return aggregate_scores(found)
+
     def by_environment(self, metric: str) -> NDArray[np.float64]:
         """Return means over the seeds, shape (E,); nan where a seed has no score."""
         with np.errstate(invalid="ignore"):

@@ -19,6 +19,7 @@ from tables import (
     outside,
     percent,
     rank_of,
+    reward_of,
     shape_name,
     shape_table,
     shown,
@@ -92,6 +93,7 @@ WHAT = {
     "LASA-26": "handwriting motions, each in one way",
     "LASA-Multi": "handwriting motions that are done in several ways",
     "Letter": "letters that are traced round and round, limit cycles in the plane",
+    "Disturbed": "handwriting motions that a mass of unknown weight is to draw in a wind",
     "Drumming": "arm that drums in MuJoCo, scored on the tip that the physics moved",
     "LetterRecorded": "letters that ImitationFlow's authors recorded, limit cycles in the plane",
 }
@@ -440,6 +442,8 @@ def board_section(board: Board, length_unit: str, *, full: bool) -> list[str]:
         "Mean rank": lambda row: rank_of(board, row),
         "Cells": lambda row: row.coverage,
     }
+    if any(row.reward() is not None for row in board.rows):
+        first["Reward a step"] = reward_of
     if not full:
         guarantee = {**first, "Guarantee": guarantee_of}
         page += aggregate_table(board, found, SMALL, length_unit, extra=guarantee)

@@ -215,6 +215,16 @@ def _marked(entry: Entry) -> str:
     return f"{text}<br><sub>{entry.interval}</sub>" if entry.interval else text
 
 
+def reward_of(row: Row) -> str:
+    """Return a row's mean reward a step, with its interval below; "–" where none was measured."""
+    found = row.reward()
+    if found is None:
+        return "–"
+    text = f"{found.mean:.3f}"
+    low, high = (f"{end:.3f}" for end in found.mean_interval)
+    return text if "nan" in (low, high) else f"{text}<br><sub>{low} to {high}</sub>"
+
+
 def outside(board: Board) -> list[tuple[str, str]]:
     """Return title and reason of each registered method that cannot learn a board's motions."""
     if board.motion == "goal":
