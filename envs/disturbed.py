@@ -4,54 +4,68 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations, FloatArray
-from iflow_gym.envs.dynamics import Arithmetic, Component, ForceControl, dot, excess
-from iflow_gym.envs.guide import CycleGuide, GoalGuide, Guide
+from iflow_gym.envs.dynamics import (
+    ARRAYS,
+    FLOATS,
+    Arithmetic,
+    Component,
+    ForceControl,
+    dot,
+    excess,
+)
 from iflow_gym.envs.point_mass import PointMassEnv
 from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
 from iflow_gym.envs.task import PointMassInterface, Push
 
-MASS_RATIO = 2.0
+MASS_RATIO = 6.0
 """Mass of the plant over the nominal one."""
 
-DAMPING_RATIO = 1.5
+DAMPING_RATIO = 3.0
 """Damping of the plant over the nominal one."""
+
+WIDTH = 0.1
+"""Widths of the reward's kernels in diagonals and in peak speeds: this far off they pay half."""
 
 
 @dataclass(frozen=True)
 class Wind:
-    r"""A smooth, bounded force field that leaves the goal in the lee.
+    r"""A force field of two parts: what blows at a place, and what turns a mass that moves aside.
 
     With o = x - x* the offset from the goal (of a motion that repeats from the mean of its
-    samples), L the `reach`, s = ||o|| / L, F_0 = c s_0 the force that damping opposes at the
-    demonstrations' peak speed s_0 (c the nominal damping), e the unit vector along `direction`, and
-    Q the quarter turn in the plane of the first two axes,
+    samples), s = ||o|| / L, L the `reach`, c the nominal damping, F_0 = c s_0 the force that it
+    opposes at the demonstrations' peak speed s_0, e the unit vector along `direction` and Q the
+    quarter turn in the plane of the first two axes,
 
-        F(x) = F_0 s^2 / (1 + s^2) (strength e + swirl Q o / ||o||).
+        F(x, v) = F_0 strength s^2 / (1 + s^2) e + curl c Q v.
 
-    So ||F|| <= F_0 (strength + swirl), F vanishes at x* with its first derivatives, and far away it
-    is a steady wind and a vortex about the goal.
+    The first is a steady wind that leaves the goal in the lee; it can hold a mass at another place,
+    where the policy commands less than the wind takes. The second is the curl field of motor
+    control (Shadmehr & Mussa-Ivaldi, J. Neuroscience 14(5), 1994, eq. 9): it vanishes at rest, so
+    that the mass rests where the policy has it rest, and nowhere else.
     """
 
-    strength: float = 0.4
-    """Of the steady wind far from the goal, in F_0."""
+    strength: float = 0.05
+    """Of the steady wind far from the goal, in F_0, >= 0."""
     direction: tuple[float, ...] | None = None
     """Where it blows to (any length but 0); None takes (0.6, -0.8): aslant across and down."""
-    swirl: float = 0.1
-    """Of the vortex round the goal, in F_0; negative turns clockwise."""
+    curl: float = 0.1
+    """Of the force across the velocity, in nominal damping; negative turns clockwise. In one
+    dimension there is none."""
     reach: float = 0.25
-    """L in diagonals of the demonstrations' bounding box: there half of the wind is felt."""
+    """L in diagonals of the demonstrations' bounding box: there half of the steady wind is felt."""
 
     def __post_init__(self) -> None:
-        for name in ("strength", "swirl"):
-            if not np.isfinite(value := getattr(self, name)):
-                raise ValueError(f"Expected a finite {name} of the wind, got {value!r}.")
+        if not (np.isfinite(self.strength) and self.strength >= 0):
+            raise ValueError(f"Expected a wind's strength >= 0 and finite, got {self.strength!r}.")
+        if not np.isfinite(self.curl):
+            raise ValueError(f"Expected a finite curl of the wind, got {self.curl!r}.")
         if not (np.isfinite(self.reach) and self.reach > 0):
             raise ValueError(f"Expected a wind's reach > 0 and finite, got {self.reach!r}.")
 
@@ -71,35 +85,37 @@ class Wind:
 class WindField:
     """A wind over one set of demonstrations, for one mass and for many (see `Wind`).
 
-    Its values are forces as actions: `scale` is F_0 in largest forces. The arithmetic is that of
-    `iflow_gym.envs.dynamics`.
+    Its values are forces as actions; a `unit` force is c in largest forces, per speed. The
+    arithmetic is that of `iflow_gym.envs.dynamics`.
     """
 
-    def __init__(self, wind: Wind, demonstrations: Demonstrations, scale: float) -> None:
+    def __init__(self, wind: Wind, demonstrations: Demonstrations, unit: float) -> None:
         d = demonstrations.n_dims
         self._centre: list[float] = demonstrations.centre.tolist()
         self._per_length = 1.0 / (wind.reach * demonstrations.bounding_box.diagonal)
-        self._steady: list[float] = (scale * wind.strength * wind.unit(d)).tolist()
-        self._swirl = scale * wind.swirl if d > 1 else 0.0
+        steady = unit * demonstrations.peak_speed * wind.strength * wind.unit(d)
+        self._steady: list[float] = steady.tolist()
+        self._curl = unit * wind.curl if d > 1 else 0.0
 
-    def at(self, ops: Arithmetic[Component], x: Sequence[Component]) -> list[Component]:
-        """Return the d components of the force at a position."""
+    def at(
+        self, ops: Arithmetic[Component], x: Sequence[Component], v: Sequence[Component]
+    ) -> list[Component]:
+        """Return the d components of the force at a position and a velocity."""
         o = [(a - c) * self._per_length for a, c in zip(x, self._centre, strict=True)]
         square = dot(o, o)
-        share = 1.0 / (1.0 + square)
-        blown = [square * e for e in self._steady]
-        if self._swirl:
-            turning = self._swirl * ops.root(square)
-            blown[0] = blown[0] - turning * o[1]
-            blown[1] = blown[1] + turning * o[0]
-        return [share * f for f in blown]
+        share = square / (1.0 + square)
+        blown = [share * e for e in self._steady]
+        if self._curl:
+            blown[0] = blown[0] - self._curl * v[1]
+            blown[1] = blown[1] + self._curl * v[0]
+        return blown
 
 
 class DisturbedControl(ForceControl):
     """Force control whose `action_for` knows the nominal mass and damping, and the plant others.
 
     The plant m' dv/dt = F + F_wind - c' v is integrated in closed form over a dt in which the
-    action F and the wind at the position where the dt begins are held: `ForceControl`'s equations
+    action F and the wind on the state in which the dt begins are held: `ForceControl`'s equations
     with m', c' and F + F_wind.
     """
 
@@ -110,7 +126,7 @@ class DisturbedControl(ForceControl):
         self._plant = ForceControl(
             mass_ratio * nominal.mass, damping_ratio * nominal.damping, nominal.max_force
         )
-        self._field = field
+        self.field = field
 
     def coefficients(self, dt: float) -> tuple[float, ...]:
         """Return what the plant's equations need of dt."""
@@ -129,7 +145,7 @@ class DisturbedControl(ForceControl):
         kept, glide, gain, reach = coefficients
         d = len(low)
         limit = excess(ops, action)
-        wind = self._field.at(ops, state[:d])
+        wind = self.field.at(ops, state[:d], state[d:])
         positions, velocities = [], []
         for x, v, a, w, wall, far in zip(
             state[:d], state[d:], action, wind, low, high, strict=True
@@ -142,38 +158,19 @@ class DisturbedControl(ForceControl):
         return positions + velocities
 
 
-class PacedGoalGuide(GoalGuide):
-    """Along a motion that ends, at the demonstrated tempo, to its goal."""
-
-    def reward(
-        self,
-        ops: Arithmetic[Component],
-        x: Sequence[Component],
-        x_next: Sequence[Component],
-        dt: Component,
-        distance: Component,
-    ) -> Component:
-        """Return the reward of a step: 1 at the goal, elsewhere the demonstrated tempo pays most.
-
-        That of motions that repeat, r = <u, n> s_k / max(||u||, s_k)^2.
-        """
-        made, pace, shown = self._progress(ops, x, x_next, dt)
-        share = ops.largest(ops.smallest(made * shown / (pace * pace), 1.0), -1.0)
-        return ops.select(distance <= self.tolerance, 1.0, share)
-
-
-@lru_cache(maxsize=64)
-def paced_guide_for(demonstrations: Demonstrations) -> Guide:
-    """Return the guide of a set of demonstrations for which tempo counts."""
-    return (PacedGoalGuide if demonstrations.period is None else CycleGuide)(demonstrations)
-
-
 class _Disturbed(PointMassInterface):
     """What the single and the batched environment add to the point mass."""
 
     mass_ratio: float
     damping_ratio: float
     wind: Wind
+    _per_width: float
+    _per_speed: float
+    _shown: FloatArray
+    """Every recording's samples with their velocities, one after the other; `_offset` is where each begins."""
+    _last: NDArray[np.intp]
+    """Index of each recording's last sample."""
+    _offset: NDArray[np.intp]
 
     def _disturb(self, mass_ratio: float, damping_ratio: float, wind: Wind | None) -> None:
         for name, value in (("mass_ratio", mass_ratio), ("damping_ratio", damping_ratio)):
@@ -185,10 +182,26 @@ class _Disturbed(PointMassInterface):
         self.wind = Wind() if wind is None else wind
         task, demos = self.task, self.demonstrations
         nominal = self._force_control()
-        scale = nominal.damping * demos.peak_speed / nominal.max_force
-        field = WindField(self.wind, demos, scale)
+        field = WindField(self.wind, demos, nominal.damping / nominal.max_force)
         task.control = DisturbedControl(nominal, self.mass_ratio, self.damping_ratio, field)
-        task.guide = paced_guide_for(demos.shown)
+        self._per_width = 1.0 / (WIDTH * task.diagonal)
+        self._per_speed = 1.0 / (WIDTH * demos.peak_speed)
+        lengths = [len(p) for p in demos.positions]
+        moving = [np.hstack(pair) for pair in zip(demos.positions, demos.velocities, strict=True)]
+        self._shown = np.concatenate(moving)
+        self._last = np.array(lengths) - 1
+        self._offset = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+
+    def _kept(
+        self, ops: Arithmetic[Component], x: Sequence[Component], shown: Sequence[Component]
+    ) -> Component:
+        """Return the mean of two kernels: of position and of velocity, 2 d components each."""
+        d = self.n_dims
+        apart = [a - p for a, p in zip(x, shown, strict=True)]
+        o = [a * self._per_width for a in apart[:d]]
+        u = [a * self._per_speed for a in apart[d:]]
+        kept: Component = 0.5 / (1.0 + dot(o, o)) + 0.5 / (1.0 + dot(u, u))
+        return kept
 
     def like(
         self,
@@ -214,14 +227,12 @@ class _Disturbed(PointMassInterface):
             return DisturbedEnv(self.demonstrations, **settings)
         return DisturbedVectorEnv(self.demonstrations, num_envs, **settings)
 
-    def wind_force(self, positions: FloatArray) -> FloatArray:
-        """Return the wind's force, kg length/s², at positions, shape (..., d) both."""
-        from iflow_gym.envs.dynamics import ARRAYS
-
-        x = self._vectors(positions, "position")
+    def wind_force(self, positions: FloatArray, velocities: FloatArray) -> FloatArray:
+        """Return the wind's force, kg length/s², at positions and velocities, shape (..., d)."""
+        x, v = self._vectors(positions, "position"), self._vectors(velocities, "velocity")
         control = self.task.control
         assert isinstance(control, DisturbedControl)
-        parts = control._field.at(ARRAYS, list(np.moveaxis(x, -1, 0)))
+        parts = control.field.at(ARRAYS, list(np.moveaxis(x, -1, 0)), list(np.moveaxis(v, -1, 0)))
         return np.asarray(np.stack(parts, axis=-1) * control.max_force)
 
 
@@ -232,31 +243,41 @@ class DisturbedEnv(_Disturbed, PointMassEnv):
     A policy commands a velocity; `command_to_action` turns it into the force with which the mass
     would have that velocity at the end of dt, if it had the nominal `mass` and `damping` and no
     wind blew. The plant has `mass_ratio` times the mass, `damping_ratio` times the damping, and a
-    wind blows that nobody is told of, as a tool of unknown weight and a draught or a loose cable
-    load a robot. So the mass lags behind every command and is blown aside, and a field that is
-    stable, and knows the demonstrations by heart, ends at the goal and is wrong on the way.
+    wind blows that nobody is told of, as a tool of unknown weight and a draught load a robot. So
+    the mass lags behind every command and is blown aside, and a field that is stable, and knows the
+    demonstrations by heart, ends at the goal and is wrong on the way.
 
-    $$m' \dot v = F + F_\text{wind}(x) - c' v$$
+    $$m' \dot v = F + F_\text{wind}(x, v) - c' v$$
 
     is integrated in closed form over a dt, with F and the wind at its beginning held. The goal lies
-    in the lee, $F_\text{wind}(x^*) = 0$, so that a policy can come to rest there;
-    `iflow_gym.envs.disturbed.Wind` has the field. `env.unwrapped.wind_force(x)` is for pictures and
-    tests: a policy is not to look.
+    in the lee, so that a policy can come to rest there. The defaults, a load of five times the own
+    mass and a light wind, are such that ImitationFlow still ends at the goal: a field commands
+    little where the recordings were slow, and a stronger wind holds it there.
+    `env.unwrapped.wind_force(x, v)` is for pictures and tests: a policy is not to look.
 
     Actions, observations (with velocities) and the rest are `PointMassEnv`'s in force mode, and
     `mass` and `damping` are the nominal ones.
 
     ## Rewards
-    `PointMassEnv`'s of a motion that repeats, which pays the demonstrated tempo most, and 1 where
-    x' is within the goal's tolerance: here tempo is what is lost. With the reward of a motion that
-    ends hurrying costs nothing.
+    How well the episode's recording i is kept, at its own time:
+
+    $$r_t = \frac{1/2}{1 + \lVert x_t - p_{i,t} \rVert^2 / w^2}
+          + \frac{1/2}{1 + \lVert v_t - \dot p_{i,t} \rVert^2 / w_v^2}$$
+
+    with w 10 % of the diagonal of the demonstrations' bounding box, w_v 10 % of their peak speed,
+    and t counted in steps; beyond the recording's end its last sample stands. 1 a step is the most.
+    `PointMassEnv`'s reward, progress, is blind to what is lost here: arriving late, or beside the
+    recording, costs it little. (A mean of kernels of the errors of position and velocity is the
+    imitation reward of Peng et al., "DeepMimic", ACM ToG 37(4), 2018; these need no exponential,
+    and their tails are longer.) From a start of the caller's choice, which has no recording, and of
+    a motion that repeats, whose rounds nobody keeps in step, the reward is `PointMassEnv`'s.
 
     ## Arguments
     | argument | default | meaning |
     | --- | --- | --- |
-    | `mass_ratio` | `2.0` | the plant's mass over the nominal one, > 0 |
-    | `damping_ratio` | `1.5` | the plant's damping over the nominal one, > 0 |
-    | `wind` | `None` | a `Wind(strength, direction, swirl, reach)`; `None` takes its defaults |
+    | `mass_ratio` | `6.0` | the plant's mass over the nominal one, > 0 |
+    | `damping_ratio` | `3.0` | the plant's damping over the nominal one, > 0 |
+    | `wind` | `None` | a `Wind(strength, direction, curl, reach)`; `None` takes its defaults |
     | the rest | | as in `PointMassEnv`, but `control_mode` |
 
     ## Version History
@@ -275,6 +296,17 @@ class DisturbedEnv(_Disturbed, PointMassEnv):
         super().__init__(demonstrations, control_mode="force", **_without_mode(kwargs))
         self._disturb(mass_ratio, damping_ratio, wind)
 
+    def step(
+        self, action: FloatArray
+    ) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Hold an action for one dt."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        i = info["demonstration"]
+        if i >= 0 and self.demonstrations.period is None:
+            shown = self._shown[self._offset[i] + min(self._count, self._last[i])]
+            reward = self._kept(FLOATS, observation.tolist(), shown.tolist())
+        return observation, reward, terminated, truncated, info
+
 
 class DisturbedVectorEnv(_Disturbed, PointMassVectorEnv):
     """Many of `DisturbedEnv`, stepped together: its numbers, bit for bit."""
@@ -291,6 +323,19 @@ class DisturbedVectorEnv(_Disturbed, PointMassVectorEnv):
     ) -> None:
         super().__init__(demonstrations, num_envs, control_mode="force", **_without_mode(kwargs))
         self._disturb(mass_ratio, damping_ratio, wind)
+
+    def step(
+        self, actions: FloatArray
+    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Hold an action, shape (n, d), for one dt; begin anew where the last step ended."""
+        observations, rewards, terminated, truncated, info = super().step(actions)
+        if self.demonstrations.period is None:
+            i = self._demonstration
+            shown = self._shown[self._offset[i] + np.minimum(self._count, self._last[i])]
+            kept = self._kept(ARRAYS, list(observations.T), list(shown.T))
+            told = (i >= 0) & (self._count > 0)  # an episode that just began has paid nothing
+            rewards = np.where(told, kept, rewards)
+        return observations, rewards, terminated, truncated, info
 
 
 class DisturbedLASAEnv(DisturbedEnv):

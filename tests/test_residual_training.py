@@ -1,7 +1,9 @@
 """Training, files and the command line of residuals, in a few steps each."""
 
 import dataclasses
+import io
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +11,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from rich.console import Console
 
 from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.datasets.lasa import load_lasa
@@ -17,7 +20,7 @@ from iflow_gym.residual.policy import Zero
 
 pytest.importorskip("stable_baselines3")
 
-from iflow_gym.baselines.residual_learning import records
+from iflow_gym.baselines.residual_learning import records, training
 from iflow_gym.baselines.residual_learning.agents import AgentFileError
 from iflow_gym.baselines.residual_learning.artifacts import (
     AGENT,
@@ -41,6 +44,14 @@ from iflow_gym.results import Result, result_path, write_result
 
 ENV = "iflow/Disturbed-Angle-v0"
 ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def _short_evaluations(monkeypatch, request):
+    """Evaluations on the way take thousands of steps: what they measure has a test of its own."""
+    if "returns" not in request.node.name:
+        monkeypatch.setattr(training, "returns_of", lambda *_: np.full(7, 0.5))
+        monkeypatch.setattr(records, "returns_of", lambda *_: np.linspace(0.1, 0.7, 7))
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +81,7 @@ def few(algorithm="ppo", **changes):
 
 @pytest.fixture(scope="module")
 def trained(model, tmp_path_factory):
+    """A run with the evaluations that it makes."""
     folder = tmp_path_factory.mktemp("runs") / "stable"
     train(folder, ENV, few(), 0, base=("imitation-flow", model), stable=0.25, tensorboard=True)
     return folder
@@ -162,7 +174,7 @@ def test_every_algorithm_trains_from_its_preset_and_is_read_back(algorithm, mode
     assert done.card.steps >= 128
     assert 0 < done.environment_share <= 1
     policy = load_residual(tmp_path, environment=ENV, base=model)
-    features = np.zeros((2, 6), dtype=np.float32)
+    features = np.zeros((2, 8), dtype=np.float32)
     actions, _ = policy.agent.predict(features, deterministic=True)
     assert actions.shape == (2, 2)
     assert np.abs(actions).max() <= 1
@@ -185,7 +197,7 @@ def test_the_same_seed_gives_the_same_agent(trained, model, tmp_path):
     base = ("imitation-flow", model)
     train(tmp_path / "a", ENV, few(), 0, base=base, stable=0.25, tensorboard=False)
     train(tmp_path / "b", ENV, few(), 1, base=base, stable=0.25, tensorboard=False)
-    features = np.random.default_rng(0).normal(size=(5, 6)).astype(np.float32)
+    features = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
     one, same, other = (
         load_residual(folder).agent.predict(features, deterministic=True)[0]
         for folder in (trained, tmp_path / "a", tmp_path / "b")
@@ -195,8 +207,6 @@ def test_the_same_seed_gives_the_same_agent(trained, model, tmp_path):
 
 
 def test_a_run_is_resumed_where_it_was(trained, tmp_path):
-    import shutil
-
     folder = tmp_path / "copy"
     shutil.copytree(trained, folder)
     before = read_card(folder).steps
@@ -217,15 +227,11 @@ def test_a_run_is_resumed_where_it_was(trained, tmp_path):
     assert resume(folder, total_steps=192).card.steps == 192
 
 
-def test_resuming_keeps_what_was_learned(trained, tmp_path):
+def test_resuming_keeps_what_was_learned(trained, tmp_path, monkeypatch):
     """The optimizer goes on too: a step from there is not a first step of Adam."""
-    import shutil
-
     folder = tmp_path / "copy"
     shutil.copytree(trained, folder)
     before = load_residual(folder).agent
-    from iflow_gym.baselines.residual_learning import training
-
     kept = {}
     original = training.set_parameters
 
@@ -234,19 +240,14 @@ def test_resuming_keeps_what_was_learned(trained, tmp_path):
         kept["weights"] = [p.detach().clone() for p in agent.policy.parameters()]
         kept["optimizer"] = len(agent.policy.optimizer.state_dict()["state"])
 
-    training.set_parameters = spy
-    try:
-        resume(folder, total_steps=192)
-    finally:
-        training.set_parameters = original
+    monkeypatch.setattr(training, "set_parameters", spy)
+    resume(folder, total_steps=192)
     for ours, theirs in zip(kept["weights"], before.policy.parameters(), strict=True):
         assert (ours == theirs).all()
     assert kept["optimizer"] > 0
 
 
 def test_another_environment_another_base_and_other_files_are_refused(trained, model, tmp_path):
-    import shutil
-
     with pytest.raises(AgentFileError, match=r"trained on, 'iflow/Disturbed-Angle-v0', got"):
         load_residual(trained, environment="iflow/LASA-Angle-v0")
     other = (
@@ -375,27 +376,45 @@ def test_rows_become_records_on_the_bases_of_the_leaderboard(model, tmp_path, mo
     }
 
 
-def test_the_command_line_trains_and_says_what_it_does_not_understand(model, tmp_path):
-    script = [sys.executable, str(ROOT / "baselines" / "residual.py")]
+def test_the_command_line_trains_resumes_scores_and_says_what_it_misses(
+    model, tmp_path, monkeypatch
+):
+    from iflow_gym.baselines import residual
+    from iflow_gym.evaluate import Evaluation
+
+    monkeypatch.setattr(
+        "iflow_gym.evaluate.evaluate", lambda *_, **__: Evaluation({"rmse": 2.5}, {}, {})
+    )
     preset = tmp_path / "few.toml"
     preset.write_text(
         '[training]\nalgorithm = "ppo"\ntotal_steps = 64\nnum_envs = 4\nn_evaluations = 1\n'
         "[algorithm]\nn_steps = 16\nbatch_size = 32\nn_epochs = 1\n[policy]\nnet_arch = [8]\n"
     )
-    run = tmp_path / "run"
-    arguments = ["train", "--base", str(model), "--stable", "--preset", str(preset)]
-    done = subprocess.run(
-        [*script, *arguments, "--output", str(run)], capture_output=True, text=True, check=False
+    folder = tmp_path / "run"
+    text = io.StringIO()
+    console = Console(file=text, width=140)
+    command = residual.Train(
+        folder, base=model, stable=True, preset=str(preset), env=ENV, progress=False
     )
-    assert done.returncode == 0, done.stderr
-    assert "64 steps in" in done.stdout
-    assert "in the environment and the base" in done.stdout
-    assert read_card(run).stable == 0.25
-    again = subprocess.run(
-        [*script, "resume", "--run", str(tmp_path)], capture_output=True, text=True, check=False
-    )
-    assert again.returncode == 2
-    assert "Expected a trained residual" in again.stderr
+    assert residual.run(command, console) == 0
+    assert "64 steps in" in text.getvalue()
+    assert "in the environment and the base" in text.getvalue()
+    assert read_card(folder).stable == 0.25
+    assert residual.run(residual.Resume(folder, total_steps=128, progress=False), console) == 0
+    assert read_card(folder).steps == 128
+    assert residual.run(residual.Score(folder), console) == 0
+    assert "rmse" in text.getvalue()
+    with pytest.raises(FileNotFoundError, match="Expected a trained residual"):
+        residual.run(residual.Resume(tmp_path), console)
+    with pytest.raises(ValueError, match=r"Expected rows among imitation-flow\+residual"):
+        residual.run(residual.Bench(rows=("sac",), output=tmp_path), console)
+
+
+def test_the_script_explains_itself():
+    script = [sys.executable, str(ROOT / "baselines" / "residual.py"), "train", "--help"]
+    done = subprocess.run(script, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "--rate-share" in done.stdout
 
 
 def test_batches_of_arrays_are_made_where_there_are_any():

@@ -236,5 +236,5 @@ def test_disabled_autoreset_is_understood(bases):
         _, _, _, truncated, _ = wrapped.step(np.zeros((2, 2)))
     assert truncated.all()
     seen, info = wrapped.reset(options={"reset_mask": np.array([True, True])})
-    assert seen.shape == (2, 6 - 2)
+    assert seen.shape == (2, 6)
     assert info["base_command"].shape == (2, 2)

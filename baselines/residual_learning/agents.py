@@ -60,7 +60,8 @@ def read_agent(
     AgentFileError
         If the file is no agent of these settings and spaces.
     """
-    agent = make_agent(settings, _spaces_only(observation_space, action_space), 0, None)
+    env = _spaces_only(observation_space, action_space, settings.num_envs)
+    agent = make_agent(settings, env, 0, None)
     set_parameters(agent, path)
     return agent
 
@@ -84,12 +85,12 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _spaces_only(observation_space: Any, action_space: Any) -> Any:
-    """Return an environment that has spaces and is never stepped."""
+def _spaces_only(observation_space: Any, action_space: Any, num_envs: int) -> Any:
+    """Return environments that have spaces and are never stepped."""
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     class Spaces(gymnasium.Env[Any, Any]):
         def __init__(self) -> None:
             self.observation_space, self.action_space = observation_space, action_space
 
-    return DummyVecEnv([Spaces])
+    return DummyVecEnv([Spaces] * num_envs)

@@ -27,6 +27,9 @@ from iflow_gym.system import DynamicalSystem
 SCALE = 0.1
 """Default of the largest residual in greatest speeds: half of the demonstrations' peak speed."""
 
+NEAR = 0.05
+"""Width of the lens on the goal in diagonals of the demonstrations' bounding box."""
+
 Features = NDArray[np.float32]
 
 
@@ -70,24 +73,33 @@ class Composition:
             centre[d:], half[d:] = 0.0, demos.peak_speed
         self._centre, self._half, self._peak = centre, half, demos.peak_speed
         self.action_space = spaces.Box(-1.0, 1.0, (d,), np.float32)
-        seen = np.concatenate(
-            [(single.high - centre) / half, np.full(d, task.max_speed / self._peak)]
-        )
-        low = np.concatenate([(single.low - centre) / half, -seen[width:]])
+        self._goal = demos.goal
+        self._near = NEAR * box.diagonal
+        near = np.ones(0 if self._goal is None else d)
+        fastest = np.full(d, task.max_speed / self._peak)
+        seen = np.concatenate([(single.high - centre) / half, fastest, near])
+        low = np.concatenate([(single.low - centre) / half, -fastest, -near])
         self.observation_space = spaces.Box(
             low.astype(np.float32), seen.astype(np.float32), dtype=np.float32
         )
 
     def features(self, observations: FloatArray, command: FloatArray) -> Features:
-        """Return what the agent sees, shape (n, observation + d), float32, of order 1.
+        """Return what the agent sees, float32, of order 1: shape (n, observation + d), or of a
+        motion that ends (n, observation + 2 d).
 
         The environment's observation, positions about the middle of the demonstrations' bounding
         box in half diagonals, velocities in the demonstrations' peak speed, anything else in half
-        the width of its range; then the base's command in peak speeds. Cut at the space's bounds.
+        the width of its range; then the base's command in peak speeds; and of a motion that ends
+        the offset o from the goal under a lens, o / sqrt(||o||^2 + w^2) with w 5 % of the diagonal,
+        since the goal's tolerance is a fiftieth of what the rest resolves. Cut at the space's
+        bounds.
         """
-        seen = np.concatenate(
-            [(observations - self._centre) / self._half, command / self._peak], axis=-1
-        ).astype(np.float32)
+        parts = [(observations - self._centre) / self._half, command / self._peak]
+        if self._goal is not None:
+            offset = observations[:, : self.n_dims] - self._goal
+            square = np.einsum("ni,ni->n", offset, offset)
+            parts.append(offset / np.sqrt(square + self._near**2)[:, None])
+        seen = np.concatenate(parts, axis=-1).astype(np.float32)
         return np.asarray(np.clip(seen, self.observation_space.low, self.observation_space.high))
 
     def positions(self, features: FloatArray) -> FloatArray:
