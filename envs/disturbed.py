@@ -167,8 +167,7 @@ class _Disturbed(PointMassInterface):
     _per_width: float
     _per_speed: float
     _shown: FloatArray
-    """Every recording's samples with their velocities, one after the other; `_offset` is where each
-    begins."""
+    """Samples and velocities of every recording after the other; `_offset` is where each begins."""
     _last: NDArray[np.intp]
     """Index of each recording's last sample."""
     _offset: NDArray[np.intp]

@@ -17,7 +17,10 @@ from iflow_gym.residual.composition import SCALE, Composition, Features, starts_
 BoolArray = NDArray[np.bool_]
 
 
-class ResidualActionWrapper(gymnasium.Wrapper[Features, FloatArray, FloatArray, FloatArray]):
+class ResidualActionWrapper(
+    gymnasium.Wrapper[Features, FloatArray, FloatArray, FloatArray],
+    gymnasium.utils.RecordConstructorArgs,
+):
     """An environment whose action is added to a base policy's velocity command.
 
     Works on the point mass in either control mode, LASA, letters, the disturbed point mass and the
@@ -65,7 +68,10 @@ class ResidualActionWrapper(gymnasium.Wrapper[Features, FloatArray, FloatArray, 
         *,
         stable: bool | float = False,
     ) -> None:
-        super().__init__(env)
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, base_policy=base_policy, scale=scale, stable=stable, _disable_deepcopy=True
+        )
+        gymnasium.Wrapper.__init__(self, env)
         self.composition = Composition(_task_of(env), base_policy, scale, stable)
         self.action_space = cast("Space[Any]", self.composition.action_space)
         self.observation_space = cast("Space[Any]", self.composition.observation_space)

@@ -132,10 +132,8 @@ def test_the_reward_is_how_well_the_recording_is_kept_at_its_own_time():
         assert reward == pytest.approx(0.5 / (1 + off) + 0.5 / (1 + off_v), rel=1e-9)
     data = env.get_dataset()
     assert data["rewards"].mean() > 0.95
-    late, _ = env.reset(options={"demonstration": 3, "start": demos.positions[3][60]})
-    assert late[0] == demos.positions[3][60][0]
-    action = np.zeros(2)
-    assert env.step(action)[1] < 0.8
+    env.reset(options={"demonstration": 3, "start": demos.positions[3][300]})  # early, and at rest
+    assert env.step(np.zeros(2))[1] < 0.7
 
 
 def test_other_starts_and_motions_that_repeat_keep_the_point_masss_reward():
