@@ -141,11 +141,11 @@ def lyapunov_of(base_policy: Any) -> Any:
     own: Callable[[], Any] | None = getattr(system, "lyapunov_function", None)
     if own is not None:
         return own()
-    from iflow_gym.baselines.imitation_flow import ImitationFlow
-    from iflow_gym.baselines.imitation_flow.lyapunov import FlowLyapunov
+    from iflow_gym.baselines.lyapunov import lyapunov_function
 
-    if isinstance(system, ImitationFlow):
-        return FlowLyapunov(system)
+    found = lyapunov_function(system)
+    if found is not None:
+        return found
     what = "a Lyapunov function" if isinstance(system, DynamicalSystem) else "a field"
     raise ValueError(
         f"Expected a base with the gradient of {what} for a stable residual, got "
