@@ -23,6 +23,11 @@ def lasa_id(shape: str) -> str:
     return f"iflow/LASA-{shape}-v0"
 
 
+def disturbed_id(shape: str) -> str:
+    """Return the id of a LASA shape that an unknown mass is to draw in a wind."""
+    return f"iflow/Disturbed-{shape}-v0"
+
+
 def letter_id(letter: str, *, recorded: bool = False) -> str:
     """Return the id of a letter, of the suite's own or of the recorded ones."""
     return f"iflow/Letter{'Recorded' if recorded else ''}-{letter}-v0"
@@ -33,6 +38,8 @@ def register_all() -> None:
     _register(POINT_MASS_ID, "point_mass:PointMassEnv", "point_mass_vector:PointMassVectorEnv")
     for shape in SHAPES:
         _register(lasa_id(shape), "lasa:LASAEnv", "lasa:LASAVectorEnv", shape=shape)
+        points = ("DisturbedLASAEnv", "DisturbedLASAVectorEnv")
+        _register(disturbed_id(shape), *(f"disturbed:{name}" for name in points), shape=shape)
     for name in ("Letter", "LetterRecorded"):
         for letter in LETTERS:
             env_id = letter_id(letter, recorded=name == "LetterRecorded")

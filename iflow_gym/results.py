@@ -37,7 +37,7 @@ Status = Literal["ok", "failed"]
 MAY_BE_NEGATIVE = "nll_"
 """How the names of the metrics begin that can be negative: densities can exceed 1."""
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,9 @@ class Result:
     likelihoods: dict[str, list[float]] = field(default_factory=dict)
     """Log densities, nats, under this cell's model of the scored demonstrations of each motion that
     it is to be told apart from, by environment id; empty where there are none."""
+    returns: dict[str, float] = field(default_factory=dict)
+    """Rewards a step of an episode from each recording's start, by the environment's own reward:
+    `mean`, `least` and `greatest` over the recordings; empty where none was asked for."""
     guarantee: Guarantee | None = None
     """What the method says of its stability; None for a failed cell and for a reference."""
     target: str | None = None
@@ -162,8 +165,8 @@ def result_path(method: str, environment: str, protocol: str, seed: int) -> Path
     for label, name in (("method", method), ("environment", short_name(environment))):
         if not _NAME.fullmatch(name):
             raise ValueError(
-                f"Expected the name of the {label} to be made of letters, digits, '.', '_' and "
-                f"'-', since it names a file, got {name!r}."
+                f"Expected the name of the {label} to be made of letters, digits, '.', '_', '+' "
+                f"and '-', since it names a file, got {name!r}."
             )
     if protocol not in PROTOCOLS:
         raise ValueError(f"Expected a protocol of {PROTOCOLS}, got {protocol!r}.")
@@ -178,19 +181,35 @@ def write_result(folder: str | os.PathLike[str], result: Result) -> Path:
     """
     target = Path(folder) / result.path
     target.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(
-        _encoded(dataclasses.asdict(result)), sort_keys=True, indent=1, allow_nan=False
-    )
-    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole({target: result_text(result).encode()})
     return target
+
+
+def result_text(result: Result) -> str:
+    """Return the text of a record's file; raise what JSON raises for what it cannot hold."""
+    values = _encoded(dataclasses.asdict(result))
+    return json.dumps(values, sort_keys=True, indent=1, allow_nan=False) + "\n"
+
+
+def write_whole(contents: Mapping[Path, bytes]) -> None:
+    """Write files whose folders exist, all of them or, where one cannot be written, none.
+
+    Neighbours ending in ``.partial`` are written, brought to the disk and renamed.
+    """
+    partials = {
+        target: target.with_name(f"{target.name}.{os.getpid()}.partial") for target in contents
+    }
+    try:
+        for target, content in contents.items():
+            with partials[target].open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        for target, partial in partials.items():
+            partial.replace(target)
+    finally:
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)
 
 
 def read_result(path: str | os.PathLike[str]) -> Result:
@@ -221,7 +240,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
             "upgrade iflow-gym."
         )
     # Records from before there were such methods and motions lack these.
-    values = {"uses_time": False, "likelihoods": {}, **values}
+    values = {"uses_time": False, "likelihoods": {}, "returns": {}, **values}
     known = {f.name for f in dataclasses.fields(Result)}
     if known != set(values):
         raise ResultFileError(
@@ -326,6 +345,9 @@ def _decoded(values: dict[str, Any]) -> Result:
         likelihoods[name] = [_number(value) for value in entries]
         if any(value is None for value in likelihoods[name]):
             raise ValueError(f"expected log densities of {name}, got {entries}")
+    returns = {key: _number(value) for key, value in values["returns"].items()}
+    if any(value is None for value in returns.values()):
+        raise ValueError(f"expected rewards as numbers, got {returns}")
     guarantee = values["guarantee"]
     return Result(
         **{
@@ -333,6 +355,7 @@ def _decoded(values: dict[str, Any]) -> Result:
             **numbers,
             "per_demonstration": lists,
             "likelihoods": likelihoods,
+            "returns": returns,
             "guarantee": None if guarantee is None else Guarantee(**guarantee),
         }
     )

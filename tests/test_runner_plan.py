@@ -134,7 +134,7 @@ def test_presets_say_what_the_documentation_says():
     assert smoke.environments == (*shapes, "Letter-O-v0")
     assert smoke.protocols == ("reproduction",)
     assert len(plan.select_environments(standard.environments)) == 30 + 4
-    assert len(plan.select_environments(full.environments)) == 30 + 4 + 1
+    assert len(plan.select_environments(full.environments)) == 30 + 4 + 1 + 2
     assert (len(standard.seeds), len(full.seeds)) == (1, 3)
 
 
