@@ -12,5 +12,6 @@ Needs the extra ``draw``. `strokes`, `motion` and `saving` do without it.
 from __future__ import annotations
 
 from iflow_gym.drawing.server import ServingError, serve
+from iflow_gym.drawing.training_steps import TrainingSteps
 
-__all__ = ["ServingError", "serve"]
+__all__ = ["ServingError", "TrainingSteps", "serve"]

@@ -18,15 +18,14 @@ from typing import Annotated
 from tyro.conf import arg
 
 from iflow_gym.drawing.server import DEFAULT_DIRECTORY, DEFAULT_PORT, ServingError, serve
+from iflow_gym.drawing.training_steps import TrainingSteps
 
 
 def draw(
     port: int = DEFAULT_PORT,
     open_browser: Annotated[bool, arg(name="open")] = True,
     directory: Path = Path(DEFAULT_DIRECTORY),
-    preview_steps: int = 150,
-    steps: int = 600,
-    full_steps: int | None = None,
+    steps: TrainingSteps = TrainingSteps(),  # noqa: B008 (frozen)
 ) -> int:
     """Draw a motion.
 
@@ -38,23 +37,12 @@ def draw(
         Open the page in the browser.
     directory
         Folder for what is saved.
-    preview_steps
-        Steps of ImitationFlow's preview.
     steps
-        Steps of the fit that replaces it.
-    full_steps
-        Steps of the fit that "Refine" asks for; by default the method's own.
+        How long ImitationFlow is trained.
     """
     try:
-        serve(
-            port,
-            open_browser,
-            directory,
-            preview_steps=preview_steps,
-            steps=steps,
-            full_steps=full_steps,
-        )
-    except (ServingError, ValueError) as error:
+        serve(port, open_browser, directory, steps=steps)
+    except ServingError as error:
         print(error, file=sys.stderr)
         return 1
     return 0
@@ -64,7 +52,11 @@ def main() -> None:
     """Run from the command line."""
     import tyro
 
-    sys.exit(tyro.cli(draw, description=__doc__, use_underscores=False))
+    sys.exit(
+        tyro.cli(
+            draw, prog="python -m iflow_gym.drawing", description=__doc__, use_underscores=False
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -18,9 +18,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from contextlib import asynccontextmanager
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from starlette.routing import Route
 from iflow_gym.drawing.local_only import LocalOnly
 from iflow_gym.drawing.saving import save_drawing
 from iflow_gym.drawing.strokes import KINDS, DrawingError, drawing_of
+from iflow_gym.drawing.training_steps import TrainingSteps
 
 PAGE_FILES = {
     "/": ("index.html", "text/html"),
@@ -58,10 +59,7 @@ class _Refused(Exception):  # noqa: N818 (an answer)
 def make_app(
     hosts: Collection[str],
     directory: Path,
-    *,
-    preview_steps: int,
-    steps: int,
-    full_steps: int | None,
+    steps: TrainingSteps,
 ) -> Starlette:
     """Return the application.
 
@@ -71,12 +69,9 @@ def make_app(
         Host headers that are the server's own, such as ``127.0.0.1:8765``.
     directory : Path
         Where drawings are saved; made when the first is.
-    preview_steps, steps : int
-        Of ImitationFlow's first two trainings.
-    full_steps : int or None
-        Of the one that "refine" asks for; None takes the method's default.
+    steps : TrainingSteps
     """
-    page = _Page(directory, preview_steps, steps, full_steps)
+    page = _Page(directory, steps)
     routes = [
         *(Route(path, _served(*entry), methods=["GET"]) for path, entry in PAGE_FILES.items()),
         Route("/api/methods", page.methods, methods=["GET"]),
@@ -91,6 +86,8 @@ def make_app(
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        # The methods are imported while the page is opened and drawn on.
+        threading.Thread(target=lambda: _fits_module().warm_up()).start()
         yield
         page.close()
 
@@ -116,27 +113,30 @@ async def _refused(_: Request, error: Exception) -> Response:
     return JSONResponse({"error": str(error)}, error.status)
 
 
-@cache
-def _fits_module() -> Any:
-    """Return `fits`, which imports torch and every method: seconds that the page does not wait."""
-    from iflow_gym.drawing import fits
+_IMPORTING = threading.Lock()
 
+
+def _fits_module() -> Any:
+    """Return `fits` with every method imported, which takes seconds the page need not wait for."""
+    with _IMPORTING:  # two threads that import the same modules from two ends may meet half way
+        from iflow_gym.drawing import fits
+
+        fits.method_entries()
     return fits
 
 
 class _Page:
     """What the routes do."""
 
-    def __init__(
-        self, directory: Path, preview_steps: int, steps: int, full_steps: int | None
-    ) -> None:
-        self._directory = directory
-        self._steps = (preview_steps, steps, full_steps)
+    def __init__(self, directory: Path, steps: TrainingSteps) -> None:
+        self._directory, self._steps = directory, steps
         self._made: Any = None
+        self._making = threading.Lock()
 
     def _fits(self) -> Any:
-        if self._made is None:
-            self._made = _fits_module().Fits(*self._steps)
+        with self._making:
+            if self._made is None:
+                self._made = _fits_module().Fits(self._steps)
         return self._made
 
     def close(self) -> None:
@@ -161,7 +161,9 @@ class _Page:
             fits = self._fits()
             entries = {entry.name: entry for entry in _fits_module().method_entries()}
             if method not in entries:
-                raise _Refused(422, f"Expected a method among {', '.join(entries)}, got {method!r}.")
+                raise _Refused(
+                    422, f"Expected a method among {', '.join(entries)}, got {method!r}."
+                )
             if not getattr(entries[method], kind):
                 ends = "end at a point" if kind == "goal" else "go round and round"
                 raise _Refused(
@@ -190,8 +192,8 @@ class _Page:
     def _fit(self, request: Request) -> Any:
         key = request.path_params["id"]
         try:
-            return self._fits()[key]
-        except KeyError:
+            return self._made[key]
+        except (KeyError, TypeError):  # TypeError: nothing has been fitted
             raise _Refused(404, "This fit is no longer there: press “Fit” again.") from None
 
     async def state(self, request: Request) -> Response:
@@ -208,7 +210,7 @@ class _Page:
 
     async def refine(self, request: Request) -> Response:
         fit = self._fit(request)
-        if not self._fits().refine(fit):
+        if not self._made.refine(fit):
             raise _Refused(409, "This fit is still running: wait, or stop it first.")
         return JSONResponse({}, 202)
 
@@ -258,12 +260,16 @@ class _Page:
                 422, f"Expected at most {MOST_STARTS} starts [x, y] within {LOST:g} mm: take fewer."
             )
 
-        def followed() -> list[Any]:
-            return [_rounded(p) for p in paths_from(model.system, fit.demonstrations, starts)]
+        def followed() -> dict[str, Any]:
+            found = paths_from(model.system, fit.demonstrations, starts)
+            return {
+                "version": version,
+                "dt": step_time(fit.demonstrations),
+                "paths": [_rounded(path) for path, _ in found],
+                "lost": [lost for _, lost in found],
+            }
 
-        paths = await run_in_threadpool(followed)
-        told = {"version": version, "dt": step_time(fit.demonstrations), "paths": paths}
-        return JSONResponse(told)
+        return JSONResponse(await run_in_threadpool(followed))
 
     async def save(self, request: Request) -> Response:
         fit = self._fit(request)

@@ -27,10 +27,8 @@ from iflow_gym.baselines.registry import METHODS, load_method
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.drawing.motion import accuracy
 from iflow_gym.drawing.strokes import Drawing
+from iflow_gym.drawing.training_steps import TrainingSteps
 from iflow_gym.system import DynamicalSystem
-
-PREVIEW_STEPS, STEPS = 150, 600
-"""Steps of ImitationFlow's first two trainings."""
 
 SEED = 0
 
@@ -79,6 +77,14 @@ def method_entries() -> list[MethodEntry]:
                 )
             )
     return entries
+
+
+def warm_up() -> None:
+    """Import every method and train for two steps: what torch does the first time is done then."""
+    method_entries()
+    line = np.linspace(1.0, 0.0, 100)[:, None] * [1.0, 0.5]
+    motion = Demonstrations.from_arrays([line], dt=0.01, length_unit="mm")
+    load_method(DEFAULT_METHOD)(n_steps=2, device="cpu").fit(motion, seed=SEED)
 
 
 @dataclass(frozen=True)
@@ -134,19 +140,13 @@ class Fits:
 
     Parameters
     ----------
-    preview_steps, steps : int
-        Of ImitationFlow's first two trainings.
-    full_steps : int or None
-        Of the training that is asked for by "refine"; None takes the method's default.
+    steps : TrainingSteps
     """
 
-    def __init__(
-        self,
-        preview_steps: int = PREVIEW_STEPS,
-        steps: int = STEPS,
-        full_steps: int | None = None,
-    ) -> None:
-        self._quick, self._full = sorted({min(preview_steps, steps), steps}), full_steps
+    def __init__(self, steps: TrainingSteps | None = None) -> None:
+        steps = TrainingSteps() if steps is None else steps
+        self._quick = sorted({min(steps.preview, steps.quick), steps.quick})
+        self._full = steps.full
         self._executor = ThreadPoolExecutor(MOST_AT_ONCE, thread_name_prefix="fit")
         self._fits: dict[str, Fit] = {}
         self._lock = threading.Lock()

@@ -48,9 +48,7 @@ class LocalOnly:
     most_bytes : int
     """
 
-    def __init__(
-        self, app: ASGIApp, hosts: Collection[str], most_bytes: int = MOST_BYTES
-    ) -> None:
+    def __init__(self, app: ASGIApp, hosts: Collection[str], most_bytes: int = MOST_BYTES) -> None:
         self._app, self._hosts, self._most_bytes = app, frozenset(hosts), most_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -19,8 +19,8 @@ N_GRID = 64
 HORIZON = 2.0
 """Paths are handed out for so many durations, or rounds, at a time."""
 
-STEP_TIMES = (0.002, 0.02)
-"""Seconds: the steps of paths are those of the demonstrations, but within this."""
+STEP_TIME = 0.004
+"""Seconds of a path's steps, where the demonstrations' are not shorter."""
 
 MOST_STEPS = 3000
 
@@ -38,13 +38,13 @@ def field_on_grid(system: DynamicalSystem) -> FloatArray:
 
 def step_time(demonstrations: Demonstrations) -> float:
     """Return the seconds between two samples of a path."""
-    return float(np.clip(demonstrations.mean_dt, *STEP_TIMES))
+    return min(STEP_TIME, demonstrations.mean_dt)
 
 
 def paths_from(
     system: DynamicalSystem, demonstrations: Demonstrations, starts: ArrayLike
-) -> list[FloatArray]:
-    """Return the paths of points, each of shape (n, 2) with its start first.
+) -> list[tuple[FloatArray, bool]]:
+    """Return the path of each point, shape (n, 2) with its start first, and whether it got lost.
 
     They are the system's own steps, `step_time` apart: exact where it has a closed form, Euler's
     where it has none. A path that gets lost ends before it does, so that it may be the start alone.
@@ -64,7 +64,7 @@ def paths_from(
         paths = system.rollout(np.asarray(starts, dtype=np.float64).reshape(-1, 2), n_steps, dt)
         near = np.linalg.norm(paths, axis=2) < LOST  # False for what is not finite
     ends = np.where(near.all(axis=1), n_steps + 1, np.argmin(near, axis=1)).clip(min=1)
-    return [path[:end] for path, end in zip(paths, ends, strict=True)]
+    return [(path[:end], end <= n_steps) for path, end in zip(paths, ends.tolist(), strict=True)]
 
 
 def accuracy(system: DynamicalSystem, demonstrations: Demonstrations) -> float:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import socket
 import sys
-import threading
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
+
+from iflow_gym.drawing.training_steps import TrainingSteps
 
 HOST = "127.0.0.1"
 
@@ -25,9 +27,7 @@ def serve(
     open_browser: bool = True,
     directory: str | os.PathLike[str] = DEFAULT_DIRECTORY,
     *,
-    preview_steps: int = 150,
-    steps: int = 600,
-    full_steps: int | None = None,
+    steps: TrainingSteps | None = None,
 ) -> None:
     """Serve the page until it is interrupted. Needs the extra ``draw``.
 
@@ -39,21 +39,14 @@ def serve(
         Open the page in the browser.
     directory : path
         Folder for what is saved; made when there is something.
-    preview_steps, steps : int
-        Of ImitationFlow's first two trainings: the preview and what replaces it.
-    full_steps : int or None
-        Of the one that "refine" asks for; None takes the method's default.
+    steps : TrainingSteps, optional
+        How long ImitationFlow is trained.
 
     Raises
     ------
     ServingError
         If the extra is not installed, or the port is taken.
-    ValueError
-        If a number of steps is none.
     """
-    for name, value in (("preview_steps", preview_steps), ("steps", steps), ("full_steps", full_steps)):
-        if value is not None and value < 1:
-            raise ValueError(f"Expected {name} >= 1, got {value}.")
     try:
         import uvicorn
 
@@ -69,23 +62,16 @@ def serve(
         hosts = [f"{HOST}:{port}", f"localhost:{port}"]
         if port == 80:
             hosts += [HOST, "localhost"]
-        app = make_app(
-            hosts,
-            Path(directory).absolute(),
-            preview_steps=preview_steps,
-            steps=steps,
-            full_steps=full_steps,
-        )
+        app = make_app(hosts, Path(directory).absolute(), steps or TrainingSteps())
         address = f"http://{HOST}:{port}/"
         print(f"Draw at {address} (Ctrl-C ends it).", flush=True)
-        # The methods are imported while the page is opened and drawn on.
-        threading.Thread(target=_warm_up, daemon=True).start()
         if open_browser and not webbrowser.open(address):
             print("No browser was found: open the address in one.", file=sys.stderr)
         config = uvicorn.Config(
             app, log_level="warning", server_header=False, timeout_graceful_shutdown=1
         )
-        uvicorn.Server(config).run(sockets=[listener])
+        with suppress(KeyboardInterrupt):  # uvicorn hands it on when it has shut down
+            uvicorn.Server(config).run(sockets=[listener])
 
 
 def _listening(port: int) -> socket.socket:
@@ -102,9 +88,3 @@ def _listening(port: int) -> socket.socket:
         ) from error
     listener.listen(128)
     return listener
-
-
-def _warm_up() -> None:
-    from iflow_gym.drawing.fits import method_entries
-
-    method_entries()

@@ -212,13 +212,13 @@ def _brought_together(positions: list[FloatArray]) -> tuple[list[FloatArray], li
         raise DrawingError(
             f"Stroke {worst + 1} ends {lengths[worst]:.0f} mm from the mean of the ends, which is "
             f"far for strokes {size:.0f} mm across: end all of them at one point, or choose "
-            "“goes round and round”."
+            "“Goes round”."
         )
     told = []
     if lengths.max() >= WORTH_SAYING:
         told.append(
-            f"The strokes were shifted by up to {lengths.max():.1f} mm, to end at the mean of their "
-            "ends."
+            f"The strokes were shifted by up to {lengths.max():.1f} mm, to end at the mean of "
+            "their ends."
         )
     return [p + shift for p, shift in zip(positions, shifts, strict=True)], told
 
@@ -233,7 +233,7 @@ def _common_period(positions: list[FloatArray], steps: list[float]) -> tuple[flo
             raise DrawingError(
                 f"Stroke {number} does not come back to where it was, in place and direction: go "
                 f"round at least {LEAST_ROUNDS:g} times without lifting the pen, better three "
-                "times, or choose “ends at a point”."
+                "times, or choose “Ends at a point”."
             ) from None
         rounds = (len(path) - 1) * dt / period
         if rounds < LEAST_ROUNDS:
