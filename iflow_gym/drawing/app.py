@@ -33,6 +33,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+from iflow_gym.baselines.registry import METHODS
 from iflow_gym.drawing.local_only import LocalOnly
 from iflow_gym.drawing.saving import save_drawing
 from iflow_gym.drawing.strokes import KINDS, DrawingError, drawing_of
@@ -117,11 +118,10 @@ _IMPORTING = threading.Lock()
 
 
 def _fits_module() -> Any:
-    """Return `fits` with every method imported, which takes seconds the page need not wait for."""
-    with _IMPORTING:  # two threads that import the same modules from two ends may meet half way
+    """Return `fits`, which imports torch: seconds that the page need not wait for."""
+    with _IMPORTING:
         from iflow_gym.drawing import fits
 
-        fits.method_entries()
     return fits
 
 
@@ -158,18 +158,16 @@ class _Page:
             raise _Refused(422, f"Expected a kind among {', '.join(KINDS)}, got {kind!r}.")
 
         def begin() -> dict[str, Any]:
-            fits = self._fits()
-            entries = {entry.name: entry for entry in _fits_module().method_entries()}
-            if method not in entries:
-                raise _Refused(
-                    422, f"Expected a method among {', '.join(entries)}, got {method!r}."
-                )
-            if not getattr(entries[method], kind):
-                ends = "end at a point" if kind == "goal" else "go round and round"
+            fits, entry = self._fits(), None
+            if isinstance(method, str) and method in METHODS:
+                entry = _fits_module().entry_of(method)
+            if entry is None:
+                raise _Refused(422, f"Expected a method that learns a field, got {method!r}.")
+            if not getattr(entry, kind):
+                ends = "end at a point" if kind == "goal" else "go round"
                 raise _Refused(
                     422,
-                    f"{entries[method].title} does not learn motions that {ends}: choose another "
-                    "method.",
+                    f"{entry.title} does not learn motions that {ends}: choose another method.",
                 )
             drawing = drawing_of(strokes, kind)
             fit = fits.start(drawing, method)
@@ -181,7 +179,7 @@ class _Page:
                 "goal": None if motion.goal is None else _rounded(motion.goal),
                 "period": motion.period,
                 "duration": float(motion.durations.mean()),
-                "refines": entries[method].refines,
+                "refines": entry.refines,
             }
 
         try:

@@ -57,34 +57,46 @@ class MethodEntry:
     """Whether it is trained in steps, of which there may be more."""
 
 
-def method_entries() -> list[MethodEntry]:
-    """Return the registered methods that learn a field, the default one first.
+_IMPORTING = threading.Lock()
 
-    Methods that follow a clock have no field to draw. This imports all of them, which takes
-    seconds.
+
+def load_system(name: str) -> type[DynamicalSystem] | None:
+    """Return the class of a registered method; None for one that follows a clock.
+
+    Such a one has no field to draw. Importing a method may take seconds; threads take turns, since
+    two that import the same modules from two ends may meet half way.
     """
-    entries = []
-    for name in sorted(METHODS, key=lambda n: n != DEFAULT_METHOD):
+    with _IMPORTING:
         method = load_method(name)
-        if issubclass(method, DynamicalSystem):
-            entries.append(
-                MethodEntry(
-                    name,
-                    method.title,
-                    method.learns_goals,
-                    method.learns_cycles,
-                    name == DEFAULT_METHOD,
-                )
-            )
-    return entries
+    return method if issubclass(method, DynamicalSystem) else None
+
+
+def method_entries() -> list[MethodEntry]:
+    """Return the registered methods that learn a field, the default one first."""
+    entries = [entry_of(name) for name in sorted(METHODS, key=lambda n: n != DEFAULT_METHOD)]
+    return [entry for entry in entries if entry is not None]
+
+
+def entry_of(name: str) -> MethodEntry | None:
+    """Return what is to be known of a registered method; None for one that follows a clock."""
+    method = load_system(name)
+    if method is None:
+        return None
+    refines = name == DEFAULT_METHOD
+    return MethodEntry(name, method.title, method.learns_goals, method.learns_cycles, refines)
 
 
 def warm_up() -> None:
-    """Import every method and train for two steps: what torch does the first time is done then."""
-    method_entries()
+    """Train the default method for two steps, and import the others.
+
+    What Python and torch do the first time is done then.
+    """
     line = np.linspace(1.0, 0.0, 100)[:, None] * [1.0, 0.5]
     motion = Demonstrations.from_arrays([line], dt=0.01, length_unit="mm")
-    load_method(DEFAULT_METHOD)(n_steps=2, device="cpu").fit(motion, seed=SEED)
+    method = load_system(DEFAULT_METHOD)
+    assert method is not None
+    method(n_steps=2, device="cpu").fit(motion, seed=SEED)
+    method_entries()
 
 
 @dataclass(frozen=True)
@@ -233,7 +245,8 @@ def _run(fit: Fit) -> None:
 
 
 def _train(fit: Fit, n_steps: int | None) -> Model:
-    method = cast(type[DynamicalSystem], load_method(fit.method))
+    method = load_system(fit.method)
+    assert method is not None, "checked when the fit was asked for"
     settings: Mapping[str, Any] = {}
     total = math.inf
     if fit.method == DEFAULT_METHOD:

@@ -22,6 +22,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.rounds import period_of
@@ -63,9 +64,13 @@ LEAST_ROUNDS = 1.5
 UNEVEN_TEMPO = 1.5
 """The slowest stroke's period in the fastest's, from which that is told."""
 
-CROSSING_NEAR, CROSSING_ANGLE, CROSSING_SAMPLES = 0.02, 60.0, 100
-"""What counts as a crossing: nearer than this fraction of the diagonal, at more than this angle in
-degrees, looked for among so many samples a stroke."""
+CROSSING_NEAR, CROSSING_ANGLE = 0.015, 45.0
+"""What counts as a crossing: nearer than this fraction of the diagonal, at more than so many
+degrees."""
+
+CROSSING_WINDOW = 0.04
+"""Directions there are those over so much of the way to either side, as a fraction of the diagonal:
+a sharp corner is no crossing."""
 
 NEAR_GOAL = 0.12
 """Where strokes come together at the goal, as a fraction of the diagonal, nothing is a crossing."""
@@ -268,20 +273,24 @@ def _sense(path: FloatArray, period: float, dt: float) -> int:
 
 def _crosses(demonstrations: Demonstrations) -> bool:
     """Return whether strokes pass one place in directions that no field can have there."""
+    diagonal = demonstrations.bounding_box.diagonal
+    near, window = CROSSING_NEAR * diagonal, CROSSING_WINDOW * diagonal
     places, directions = [], []
     for path in demonstrations.positions:
-        thin = path[np.linspace(0, len(path) - 1, CROSSING_SAMPLES).astype(int)]
-        step = np.diff(thin, axis=0)
-        length = np.linalg.norm(step, axis=1)
-        moves = length > 0
-        places.append((thin[:-1] + step / 2)[moves])
-        directions.append((step / length[:, None].clip(min=1e-12))[moves])
+        way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
+        at = np.arange(0.0, way[-1], near / 2)
+        here, ahead, behind = (
+            np.stack([np.interp(at + shift, way, column) for column in path.T], axis=1)
+            for shift in (0.0, window, -window)
+        )
+        places.append(here)
+        directions.append(ahead - behind)
     place, direction = np.concatenate(places), np.concatenate(directions)
-    diagonal = demonstrations.bounding_box.diagonal
     if demonstrations.goal is not None:
         away = np.linalg.norm(place - demonstrations.goal, axis=1) > NEAR_GOAL * diagonal
         place, direction = place[away], direction[away]
-    square = (place**2).sum(axis=1)
-    apart = square[:, None] + square - 2 * place @ place.T
-    across = direction @ direction.T < np.cos(np.radians(CROSSING_ANGLE))
-    return bool((across & (apart < (CROSSING_NEAR * diagonal) ** 2)).any())
+    one, other = cKDTree(place).query_pairs(near, output_type="ndarray").T
+    lengths = np.linalg.norm(direction, axis=1)
+    alike = np.einsum("ij,ij->i", direction[one], direction[other])
+    limit = np.cos(np.radians(CROSSING_ANGLE)) * lengths[one] * lengths[other]
+    return bool((alike < limit).any())
