@@ -5,7 +5,8 @@ in time, on a whole number of pixels, with a hand that rests before it sets off 
 Made even of it is what the methods expect:
 
 1. A wait is cut out: a gap between two samples longer than `WAIT` in which the pen hardly moved. A
-   field has one velocity at a place, so that a motion which waits and goes on is none.
+   field has one velocity at a place, so that a motion which waits and goes on is none. What is left
+   is the time that the move takes at the stroke's pace.
 2. Rest at both ends is trimmed: samples within `STILL` of the first, and of the last.
 3. The rest is interpolated linearly on an even grid and smoothed in time by a Gaussian, whose
    standard deviation is `SMOOTHING`; the ends stay where they are.
@@ -31,8 +32,8 @@ Kind = Literal["goal", "cycle"]
 """Whether strokes end at a point or go round and round."""
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
-WAIT, WAIT_MOVES, WAIT_LEFT = 0.1, 2.0, 0.03
-"""A gap of more seconds with a move of fewer millimetres is a wait; so many seconds are left."""
+WAIT, WAIT_PACE = 0.1, 0.2
+"""A gap of more seconds in which the pen moves at less than this fraction of its pace is a wait."""
 
 STILL = 0.5
 """Millimetres about an end within which the pen rests."""
@@ -64,7 +65,7 @@ LEAST_ROUNDS = 1.5
 UNEVEN_TEMPO = 1.5
 """The slowest stroke's period in the fastest's, from which that is told."""
 
-CROSSING_NEAR, CROSSING_ANGLE = 0.015, 45.0
+CROSSING_NEAR, CROSSING_ANGLE = 0.01, 60.0
 """What counts as a crossing: nearer than this fraction of the diagonal, at more than so many
 degrees."""
 
@@ -122,7 +123,7 @@ def drawing_of(strokes: Sequence[ArrayLike], kind: Kind) -> Drawing:
     tidied = [_tidied(stroke, number) for number, stroke in enumerate(strokes, 1)]
     positions, steps = [t.positions for t in tidied], [t.dt for t in tidied]
     notices = []
-    if waited := sum(t.waited for t in tidied):
+    if (waited := sum(t.waited for t in tidied)) >= WAIT:
         notices.append(
             f"Waits of {waited:.1f} s in all were cut out: a field has one velocity at each place."
         )
@@ -183,11 +184,12 @@ def _tidied(stroke: ArrayLike, number: int) -> _Tidied:
     first = int(np.argmax(np.linalg.norm(points - points[0], axis=1) > STILL)) - 1
     last = len(points) - int(np.argmax(np.linalg.norm(points - points[-1], axis=1)[::-1] > STILL))
     times, points = times[first : last + 1], points[first : last + 1]
-    gaps = np.diff(times)
-    waits = (gaps > WAIT) & (np.linalg.norm(np.diff(points, axis=0), axis=1) < WAIT_MOVES)
+    gaps, moves = np.diff(times), np.linalg.norm(np.diff(points, axis=0), axis=1)
+    pace = moves.sum() / np.minimum(gaps, WAIT).sum()
+    kept = np.where((gaps > WAIT) & (moves < WAIT_PACE * pace * gaps), moves / pace, gaps)
     # A wait before the first move and after the last one is rest at an end.
-    waited = float((gaps[1:-1] - WAIT_LEFT)[waits[1:-1]].sum())
-    times = np.r_[0.0, np.cumsum(np.where(waits, WAIT_LEFT, gaps))]
+    waited = float((gaps - kept)[1:-1].sum())
+    times = np.r_[0.0, np.cumsum(kept)]
     if times[-1] < LEAST_DURATION:
         raise DrawingError(
             f"Stroke {number} took {times[-1]:.2f} s, and {LEAST_DURATION:g} s are the least to be "
@@ -278,7 +280,7 @@ def _crosses(demonstrations: Demonstrations) -> bool:
     places, directions = [], []
     for path in demonstrations.positions:
         way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
-        at = np.arange(0.0, way[-1], near / 2)
+        at = np.arange(window, way[-1] - window, near / 2)
         here, ahead, behind = (
             np.stack([np.interp(at + shift, way, column) for column in path.T], axis=1)
             for shift in (0.0, window, -window)
