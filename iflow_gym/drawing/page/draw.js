@@ -303,17 +303,25 @@ function drawTrail(brush, pixel, point) {
   brush.globalAlpha = 1;
 }
 
-let wanted = false;
+let [wanted, dirty] = [false, false];
 
 function redraw() {
-  if (wanted) return;
+  dirty = true;
+  if (!wanted) requestAnimationFrame(frame);
   wanted = true;
-  requestAnimationFrame((now) => {
-    wanted = false;
-    const moves = advance(now);
+}
+
+// Points creep up to where they rest: what moves by less than a fourth of a pixel is not drawn anew.
+function frame(now) {
+  const moves = advance(now);
+  const quarter = HALF / 2 / Math.max(1, surface.clientWidth);
+  if (dirty || page.points.some((p) => distance(p.at, p.drawn || [Infinity, 0]) > quarter)) {
     drawSurface();
-    if (moves) redraw();
-  });
+    for (const point of page.points) point.drawn = [...point.at];
+  }
+  dirty = false;
+  wanted = moves;
+  if (moves) requestAnimationFrame(frame);
 }
 
 function redrawAll() {
