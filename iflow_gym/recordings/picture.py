@@ -63,7 +63,8 @@ def cleaning_figure(cleaned: Cleaned) -> Figure:
         ax.set_xlabel("time (s)")
         ax.set_ylabel(f"speed ({unit}/s)")
         ax.set_xlim(speed_before.get_xlim())
-        ax.set_ylim(bottom=0)
+        highest = max(a.get_ylim()[1] for a in (speed_before, speed_after))
+        ax.set_ylim(0, highest)
     figure.suptitle(demos.name, color=INK)
     for ax in (before, after, speed_before, speed_after):
         ax.set_facecolor(PAPER)

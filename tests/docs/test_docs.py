@@ -20,7 +20,8 @@ def load(path):
     return module
 
 
-python_snippets = load(Path(__file__).with_name("snippets.py")).python_snippets
+_snippets = load(Path(__file__).with_name("snippets.py"))
+python_snippets, snippets = _snippets.python_snippets, _snippets.snippets
 
 SNIPPETS = [
     pytest.param(text, id=f"{page.relative_to(ROOT)}-{i}")
@@ -45,6 +46,47 @@ def test_snippet_runs_from_a_neutral_folder(snippet, tmp_path):
     assert done.returncode == 0, done.stderr
     for line, said in re.findall(r"^(print\(.*?\))  # (True|False|proved)", snippet, flags=re.M):
         assert said in done.stdout, f"{line} was to print {said}:\n{done.stdout}"
+
+
+def test_the_commands_of_the_page_on_own_motions_run_one_after_another(tmp_path):
+    """As a person types them, in a folder with the recording."""
+    commands = "".join(snippets(ROOT / "docs" / "your-own-motions.md", "sh"))
+    assert commands.count("iflow-gym ") >= 5
+    path = tmp_path / "bin"
+    path.mkdir()
+    for name, line in (("iflow-gym", "-m iflow_gym"), ("python", "")):
+        shim = path / name
+        shim.write_text(f'#!/bin/sh\nexec "{sys.executable}" -W error {line} "$@"\n')
+        shim.chmod(0o755)
+    folder = tmp_path / "work"
+    folder.mkdir()
+    drawn = subprocess.run(
+        [sys.executable, ROOT / "docs" / "hand_drawn.py"], capture_output=True, check=True
+    )
+    (folder / "reach.csv").write_bytes(drawn.stdout)
+    environ = {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    done = subprocess.run(
+        ["sh", "-e", "-c", commands],
+        cwd=folder,
+        env=os.environ | environ | {"PATH": f"{path}{os.pathsep}{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Stability: proved." in done.stdout
+    made = {p.name for p in folder.iterdir()}
+    assert {"reach.png", "field.png", "policy.onnx", "unseen.json", "path.csv"} <= made
+    page = (ROOT / "docs" / "your-own-motions.md").read_text()
+    said = [
+        line
+        for line in page.splitlines()
+        if line.startswith(("reach.csv", "lengths", "the motion"))
+    ]
+    assert len(said) >= 6
+    for line in said:
+        assert line in done.stderr, f"the page quotes a line that is not said: {line}"
 
 
 def test_there_are_snippets():
