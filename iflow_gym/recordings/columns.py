@@ -214,9 +214,9 @@ def from_arrays(arrays: Mapping[str, np.ndarray[Any, Any]], columns: Columns, na
     if not keys or all(numbers[k].ndim == 1 or 1 in numbers[k].shape for k in keys):
         return _table_of(arrays, numbers, columns, name)
     result = Reading()
-    base = re.sub(r"[._ ]?\d+$", "", keys[0]) if len(keys) > 1 else None
     for key in keys:
-        suffix = key[len(base) :] if base is not None else ""
+        number = re.search(r"[._ ]?\d+$", key)
+        suffix = number[0] if number else ""
         result = result + _stack(key, suffix, numbers, arrays, columns, name, len(keys) > 1)
     return result
 

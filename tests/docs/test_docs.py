@@ -48,27 +48,40 @@ def test_snippet_runs_from_a_neutral_folder(snippet, tmp_path):
         assert said in done.stdout, f"{line} was to print {said}:\n{done.stdout}"
 
 
+COMMANDS = """\
+import contextlib, runpy, shlex, sys
+from iflow_gym.cli import run
+
+for line in open(sys.argv[1]):
+    words = shlex.split(line)
+    output = sys.stdout
+    if ">" in words:
+        words, output = words[:-2], open(words[-1], "w")
+    with contextlib.redirect_stdout(output):
+        if words[0] == "python":
+            runpy.run_path(words[1])
+        else:
+            assert words[0] == "iflow-gym" and run(words[1:]) == 0, line
+    output.flush()
+"""
+"""Runs a page's commands in one process, which imports what is heavy once."""
+
+
 def test_the_commands_of_the_page_on_own_motions_run_one_after_another(tmp_path):
     """As a person types them, in a folder with the recording."""
-    commands = "".join(snippets(ROOT / "docs" / "your-own-motions.md", "sh"))
+    page = ROOT / "docs" / "your-own-motions.md"
+    commands = "".join(snippets(page, "sh"))
     assert commands.count("iflow-gym ") >= 5
-    path = tmp_path / "bin"
-    path.mkdir()
-    for name, line in (("iflow-gym", "-m iflow_gym"), ("python", "")):
-        shim = path / name
-        shim.write_text(f'#!/bin/sh\nexec "{sys.executable}" -W error {line} "$@"\n')
-        shim.chmod(0o755)
-    folder = tmp_path / "work"
-    folder.mkdir()
+    (tmp_path / "commands").write_text(commands)
+    (tmp_path / "run_all.py").write_text(COMMANDS)
     drawn = subprocess.run(
         [sys.executable, ROOT / "docs" / "hand_drawn.py"], capture_output=True, check=True
     )
-    (folder / "reach.csv").write_bytes(drawn.stdout)
-    environ = {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    (tmp_path / "reach.csv").write_bytes(drawn.stdout)
     done = subprocess.run(
-        ["sh", "-e", "-c", commands],
-        cwd=folder,
-        env=os.environ | environ | {"PATH": f"{path}{os.pathsep}{os.environ['PATH']}"},
+        [sys.executable, "-W", "error", "run_all.py", "commands"],
+        cwd=tmp_path,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
         capture_output=True,
         text=True,
         timeout=300,
@@ -76,12 +89,11 @@ def test_the_commands_of_the_page_on_own_motions_run_one_after_another(tmp_path)
     )
     assert done.returncode == 0, done.stderr
     assert "Stability: proved." in done.stdout
-    made = {p.name for p in folder.iterdir()}
+    made = {p.name for p in tmp_path.iterdir()}
     assert {"reach.png", "field.png", "policy.onnx", "unseen.json", "path.csv"} <= made
-    page = (ROOT / "docs" / "your-own-motions.md").read_text()
     said = [
         line
-        for line in page.splitlines()
+        for line in page.read_text().splitlines()
         if line.startswith(("reach.csv", "lengths", "the motion"))
     ]
     assert len(said) >= 6
