@@ -29,6 +29,8 @@ def mathml(tex: str, *, block: bool) -> str:
     """
     known = re.sub(r"\\arg\\(min|max)(?![a-z])", r"\\operatorname{arg\\,\1}", tex)
     element = convert(known, display="block" if block else "inline")
+    # A norm's bars would stretch as far as the highest exponent, and the one that has it would not.
+    element = element.replace("<mo>&#x02016;</mo>", '<mo stretchy="false">&#x02016;</mo>')
     if unknown := re.findall(r">(\\[A-Za-z]+)<", element):
         raise ValueError(f"Expected TeX that can be converted, got {unknown} in {tex!r}.")
     body = element[element.index(">") + 1 : element.rindex("</math>")]
