@@ -131,9 +131,10 @@ FAMILIES = (
         "a LASA shape, a plant of unknown mass, and wind",
         DisturbedLASAEnv,
         "disturbed.png",
-        "Paths on the nominal plant, and on the disturbed one, which the wind blows aside",
-        "The same ImitationFlow commands both: it is proved for the velocity that it commands, and "
-        "the plant on the right does not do what it is told.",
+        "Paths on the nominal plant, and on the disturbed one, where they are late and stop short",
+        "The same ImitationFlow commands both plants, for as long as each recording lasts. The one "
+        "on the right is heavier than its controller is told and lags behind, in the wind of the "
+        "arrows: the motion is late.",
         tuple(map(disturbed_id, SHAPES)),
         more=f"""With your own recordings: `iflow_gym.envs.disturbed.DisturbedEnv(demonstrations)`.
 [Residuals on a learned motion](../residual.md) are what it is for.
