@@ -21,6 +21,9 @@ CONTRASTS = (Path(__file__).parents[1] / "contrasts.js").read_text(encoding="utf
 REFUSED = ("responded with a status of 422", "responded with a status of 500")
 """What the browser's console says where the server refuses a drawing, or fails."""
 
+PATIENCE = 120_000
+"""Milliseconds that a busy machine is given for what takes one or two."""
+
 
 @pytest.fixture(scope="module")
 def browser():
@@ -41,6 +44,7 @@ def open_page(browser, server):
 
     def opened(**options):
         context = browser.new_context(**{"viewport": {"width": 1100, "height": 800}, **options})
+        context.set_default_timeout(PATIENCE)
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: wrong.append(message.text))

@@ -10,6 +10,8 @@ const MOST_TRAIL = 1000; // samples, of 4 ms
 const MOST_STROKES = 30;
 const POLL = 150; // ms
 
+let methods = []; // that the server offers, when it has them
+
 const $ = (id) => document.getElementById(id);
 const surface = $("surface");
 const still = matchMedia("(prefers-reduced-motion: reduce)");
@@ -575,7 +577,7 @@ $("example").addEventListener("click", () => {
 
 async function startFit() {
   complain("");
-  say("Fitting …");
+  say(methods.length ? "Fitting …" : "The server is still starting; then it fits …");
   $("fit").disabled = true;
   page.asked += 1;
   const mine = page.asked;
@@ -873,8 +875,6 @@ $("save").addEventListener("submit", async (event) => {
 });
 
 // The rest of the controls ----------------------------------------------------------------------
-
-let methods = [];
 
 function offerMethods() {
   const select = $("method");
