@@ -173,9 +173,7 @@ FAMILIES = (
 
 def environments() -> str:
     """Return the page that leads to the families."""
-    rows = "\n".join(
-        f"| [`{f.ids}`](environments/{f.page}.md) | {f.words} |" for f in FAMILIES
-    )
+    rows = "\n".join(f"| [`{f.ids}`](environments/{f.page}.md) | {f.words} |" for f in FAMILIES)
     return f"""# Environments
 
 ![A frame: stream lines of a policy, the recordings, the mass](images/environment.png)
@@ -206,7 +204,9 @@ def facts(ids: Sequence[str]) -> str:
         demos = gymnasium.make(env_id).unwrapped.demonstrations
         samples = sorted({len(p) for p in demos.positions})
         counts = "–".join(dict.fromkeys(str(n) for n in (samples[0], samples[-1])))
-        size = " × ".join(f"{side:.0f}" for side in demos.bounding_box.high - demos.bounding_box.low)
+        size = " × ".join(
+            f"{side:.0f}" for side in demos.bounding_box.high - demos.bounding_box.low
+        )
         peak = max(float(np.linalg.norm(v, axis=1).max()) for v in demos.velocities)
         cells = (f"{demos.durations.mean():.3g}", size, f"{peak:.1f}")
         rows.append(" | ".join([f"| `{env_id}`", str(len(demos)), counts, *cells]) + " |")

@@ -4,7 +4,7 @@
 # # Your own data
 #
 # From a CSV file of recordings to a policy: reading, checking, learning, comparing two methods,
-# keeping the better one in a file, and exporting it for a controller.
+# and keeping the one that always arrives in a file.
 #
 # The picture first. *Left:* the recordings, with uneven samples. *Middle:* a Gaussian mixture
 # regression learned from them, *right:* ImitationFlow, both from starts around the recordings.
@@ -27,7 +27,7 @@ from iflow_gym.baselines.gmr import GMR
 from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.plotting import plot_field
 
-N_STEPS = int(os.environ.get("EXAMPLE_STEPS", 400))  # of training; None is the default, 4500
+N_STEPS = int(os.environ.get("EXAMPLE_STEPS", 300))  # of training; None is the default, 4500
 IMAGES = Path(os.environ.get("EXAMPLE_IMAGES", Path(__file__).parent / "images"))
 FOLDER = Path(tempfile.mkdtemp())
 

@@ -42,9 +42,7 @@ def played(costs, oversleep=0.0, period=1e-3):
         return 0.5 * x
 
     n = 40
-    ticks = loop.run(
-        step, STARTS, n, period, 2e-4, clock, lambda s: clock.pass_(s + oversleep)
-    )
+    ticks = loop.run(step, STARTS, n, period, 2e-4, clock, lambda s: clock.pass_(s + oversleep))
     return ticks, seen
 
 
