@@ -26,6 +26,7 @@ from iflow_gym.baselines.residual_learning.artifacts import (
     AGENT,
     BASE,
     CARD,
+    LAST,
     load_residual,
     read_card,
 )
@@ -193,17 +194,15 @@ def test_a_run_leaves_checkpoints_curves_and_evaluations(trained, model):
     assert curve[-1]["steps"] == card.steps
 
 
-def test_the_same_seed_gives_the_same_agent(trained, model, tmp_path):
-    base = ("imitation-flow", model)
-    train(tmp_path / "a", ENV, few(), 0, base=base, stable=0.25, tensorboard=False)
-    train(tmp_path / "b", ENV, few(), 1, base=base, stable=0.25, tensorboard=False)
-    features = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
-    one, same, other = (
-        load_residual(folder).agent.predict(features, deterministic=True)[0]
-        for folder in (trained, tmp_path / "a", tmp_path / "b")
-    )
-    np.testing.assert_array_equal(one, same)
-    assert (one != other).any()
+def test_the_same_seed_gives_the_same_agent(model, tmp_path):
+    base, features = ("imitation-flow", model), np.random.default_rng(0).normal(size=(5, 8))
+    found = []
+    for name, seed in (("one", 0), ("same", 0), ("other", 1)):
+        train(tmp_path / name, ENV, few(), seed, base=base, stable=0.25, tensorboard=False)
+        agent = load_residual(tmp_path / name).agent
+        found.append(agent.predict(features.astype(np.float32), deterministic=True)[0])
+    np.testing.assert_array_equal(found[0], found[1])
+    assert (found[0] != found[2]).any()
 
 
 def test_a_run_is_resumed_where_it_was(trained, tmp_path):
@@ -221,16 +220,35 @@ def test_a_run_is_resumed_where_it_was(trained, tmp_path):
     assert curve[0] < before < curve[-1] == 256
     # An interrupted run has no agent yet: its last checkpoint is taken.
     (folder / AGENT).unlink()
+    (folder / LAST).unlink()
     for later in (folder / "checkpoints").glob("agent_*_steps.zip"):
         if int(later.stem.split("_")[1]) > 64:
             later.unlink()
     assert resume(folder, total_steps=192).card.steps == 192
 
 
+def test_the_agent_of_the_best_evaluation_is_kept(model, tmp_path, monkeypatch):
+    """The means come in this order; ties go to the later one."""
+    means, seen = iter([0.2, 0.7, 0.7, 0.3]), []
+
+    def evaluated(agent, *_):
+        seen.append([p.detach().clone() for p in agent.policy.parameters()])
+        return np.full(7, next(means))
+
+    monkeypatch.setattr(training, "returns_of", evaluated)
+    settings = few(total_steps=192, n_evaluations=3)
+    train(tmp_path, ENV, settings, 0, base=("imitation-flow", model), tensorboard=False)
+    kept = list(load_residual(tmp_path).agent.policy.parameters())
+    assert len(seen) == 4
+    assert all((ours == theirs).all() for ours, theirs in zip(kept, seen[2], strict=True))
+    assert any((ours != theirs).any() for ours, theirs in zip(kept, seen[1], strict=True))
+
+
 def test_resuming_keeps_what_was_learned(trained, tmp_path, monkeypatch):
     """The optimizer goes on too: a step from there is not a first step of Adam."""
     folder = tmp_path / "copy"
     shutil.copytree(trained, folder)
+    shutil.copyfile(folder / LAST, folder / AGENT)  # in place of the best one
     before = load_residual(folder).agent
     kept = {}
     original = training.set_parameters

@@ -45,8 +45,8 @@ class TrainingSettings:
     that noise alone carries inward; what an agent leaves to it is missing when it acts without."""
     action_noise: float = 0.0
     """Standard deviation of the noise of TD3's exploration, in largest residuals."""
-    n_evaluations: int = 10
-    """How often the agent is evaluated, evenly, on all recordings' starts."""
+    n_evaluations: int = 20
+    """How often the agent is evaluated, evenly, on all recordings' starts; the best one is kept."""
     n_checkpoints: int = 4
     """How often the agent is kept as a checkpoint, evenly."""
     keywords: dict[str, Any] = field(default_factory=dict)
