@@ -81,10 +81,10 @@ def draw(task: Any, found: dict[str, Any]) -> Figure:
 
 
 def _wind(ax: Any, task: Any) -> None:
-    """Draw the wind's force as arrows over the axes."""
+    """Draw the wind's force on a mass at rest as arrows over the axes."""
     across, up = (np.linspace(*ends, ARROWS + 2)[1:-1] for ends in (ax.get_xlim(), ax.get_ylim()))
     points = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
-    force = task.wind_force(points)
+    force = task.wind_force(points, np.zeros_like(points))
     ax.quiver(*points.T, *force.T, color="#b9b3a6", width=0.004, zorder=0.5)
 
 

@@ -59,8 +59,9 @@ import numpy as np
 
 from iflow_gym.demonstrations import FloatArray
 
-RATE_SHARE = 0.25
-"""Default of the required rate, as a share of the base's own slowest."""
+RATE_SHARE = 1.0
+"""Default of the required rate, as a share of the base's own slowest. A smaller one leaves the agent
+more freedom where it does not matter: near the goal, where it then comes to rest later."""
 
 CHORDS = 4
 """How often what is added is shortened before the base's own command is taken."""
