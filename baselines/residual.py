@@ -48,7 +48,7 @@ class Train:
     stable: bool = False
     """Project the command so that the base's Lyapunov function falls."""
     rate_share: float | None = None
-    """Required rate of --stable, as a share of the base's slowest; all of it by default."""
+    """Required rate of --stable, as a share of the base's slowest; 0.9 by default."""
     preset: str = "ppo"
     """ppo, sac, td3, or a path to a TOML file like theirs in baselines/presets/residual."""
     seed: int = 0

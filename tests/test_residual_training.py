@@ -417,7 +417,7 @@ def test_the_command_line_trains_resumes_scores_and_says_what_it_misses(
     assert residual.run(command, console) == 0
     assert "64 steps in" in text.getvalue()
     assert "in the environment and the base" in text.getvalue()
-    assert read_card(folder).stable == 1.0
+    assert read_card(folder).stable == 0.9
     assert residual.run(residual.Resume(folder, total_steps=128, progress=False), console) == 0
     assert read_card(folder).steps == 128
     assert residual.run(residual.Score(folder), console) == 0
