@@ -217,7 +217,7 @@ def test_on_the_cycle_the_tempo_is_the_agents_at_the_environments_dt(letter):
         wrapped = ResidualActionWrapper(envs, letter, scale=0.2, stable=True)
         _, info = wrapped.reset(seed=0, options={"start": on_it})
         values, base = [], info["base_command"]
-        for _ in range(50):
+        for _ in range(20):  # less than half a round, even in haste
             action = faster * base / (0.2 * envs.unwrapped.max_speed)
             _, _, _, _, info = wrapped.step(action)
             x = np.stack(envs.unwrapped._state, axis=-1)
@@ -229,8 +229,8 @@ def test_on_the_cycle_the_tempo_is_the_agents_at_the_environments_dt(letter):
     start = letter._encode(on_it[None])[0][0]
     begin = np.arctan2(start[1], start[0])
     way = {k: abs((v - begin + np.pi) % (2 * np.pi) - np.pi) for k, v in turned.items()}
-    assert way[-0.5] < 0.6 * way[0.0]
-    assert way[0.5] > 1.4 * way[0.0]
+    assert way[-0.5] < 0.75 * way[0.0]
+    assert way[0.5] > 1.25 * way[0.0]
 
 
 def test_bad_arguments_say_what_was_expected(angle):
