@@ -9,12 +9,13 @@ BOARD := $(if $(filter smoke,$(PRESET)),results/smoke-board,leaderboard)
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help leaderboard test lint wheel clean
+.PHONY: help leaderboard check test lint wheel clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make leaderboard   fit the baselines on LASA, score them, write leaderboard/LEADERBOARD.md"
 	@echo "                   (PRESET=smoke|standard|full, default standard: half an hour on two cores)"
+	@echo "make check         check leaderboard/results: records, hashes, the board that they make"
 	@echo "make test          run the tests, the linter and the type checker"
 	@echo "make wheel         build the wheel, install it into an empty environment, try it there"
 
@@ -31,6 +32,12 @@ leaderboard: $(STAMP)
 	    --output $(RESULTS) || status=$$?; \
 	if [ $$status -gt 1 ]; then exit $$status; fi; \
 	$(BIN)/python leaderboard/build.py --results $(RESULTS) --output $(BOARD) && exit $$status
+
+# Files alone: `--cells 3` would score some cells of each method again, which takes minutes.
+check: $(STAMP)
+	$(BIN)/python -m iflow_gym.leaderboard check leaderboard/results --cells 0
+	@if $(BIN)/python leaderboard/build.py --help | grep -q -- --check; then \
+	    echo "leaderboard/build.py --check"; $(BIN)/python leaderboard/build.py --check; fi
 
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet --numprocesses 2

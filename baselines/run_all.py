@@ -9,28 +9,40 @@ failed is tried again. Ctrl-C keeps what is done.
 
 From any folder, with a method of one's own, also where iflow_gym is installed without its checkout:
 
-    python -m iflow_gym.baselines.run_all --methods my_module:MyMethod --output results
+    python -m iflow_gym.baselines.run_all --method my_module:MyMethod --output results
+
+On the workers of a Dask cluster (docs/clusters.md), where Ctrl-C and a new run do the same:
+
+    python baselines/run_all.py --backend dask --scheduler tcp://host:8786
 
 Methods that fit several motions together do so in batches of the selected environments, and scores
 depend a little on the batch: another selection of environments is another batch, hence a new run.
 
 Exit status: 0 when every cell has scores, 1 when one failed, 2 for a name or a preset that is not
-understood, 130 after Ctrl-C.
+understood, 3 where the run could not go on (the disk is full, another run writes into the folder,
+no scheduler is there), 130 after Ctrl-C. Whatever ended a run, records are whole or absent, and the
+next run goes on from there.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import signal
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+
+from tyro.conf import arg
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from iflow_gym.baselines.runner.plan import Job
 
 # What is heavy is imported where it is used: workers import this file, too.
 
@@ -41,7 +53,7 @@ class RunOptions:
 
     preset: Literal["smoke", "standard", "full"] = "standard"
     """smoke: a minute, for CI. standard: the leaderboard's numbers, one seed. full: three seeds."""
-    methods: tuple[str, ...] = ()
+    methods: Annotated[tuple[str, ...], arg(aliases=["--method"])] = ()
     """Globs over registered names, references among them; or anyone's package.module:Class, which
     runs with its default settings. All by default."""
     envs: tuple[str, ...] = ()
@@ -60,6 +72,12 @@ class RunOptions:
     """Seconds that a cell may take to be fitted and scored; the preset's by default."""
     force: bool = False
     """Redo cells that are up to date."""
+    backend: Literal["processes", "dask"] = "processes"
+    """Where cells run: in processes of this machine, or on the workers of a Dask cluster."""
+    scheduler: str | None = None
+    """Address of the Dask scheduler, such as tcp://host:8786."""
+    json: Path | None = None
+    """File to write what the run did into: cells, seconds, and what each method took of them."""
 
 
 def run_all(options: RunOptions, console: Console) -> int:
@@ -69,13 +87,20 @@ def run_all(options: RunOptions, console: Console) -> int:
     ------
     ValueError
         If a method, an environment or a preset is unknown.
+    FolderInUseError
+        If another run writes into the folder.
+    CannotWriteError, OSError
+        If the disk is full or worse.
+    ClusterError
+        If there is no scheduler, or its workers run other code, data or libraries.
     KeyboardInterrupt
         On Ctrl-C.
     """
     from iflow_gym.baselines.runner import plan
-    from iflow_gym.baselines.runner.pool import Pool
+    from iflow_gym.baselines.runner.lock import output_lock
     from iflow_gym.baselines.runner.presets import load_preset
-    from iflow_gym.baselines.runner.report import Reporter, summary
+    from iflow_gym.baselines.runner.report import Reporter, Spent, summary
+    from iflow_gym.baselines.runner.store import sweep
     from iflow_gym.demonstrations import PROTOCOLS
     from iflow_gym.results import read_result
 
@@ -90,32 +115,86 @@ def run_all(options: RunOptions, console: Console) -> int:
     jobs = os.cpu_count() or 1 if options.jobs is None else options.jobs
     if jobs < 1 or preset.time_limit <= 0:
         raise ValueError(f"Expected jobs >= 1 and time_limit > 0, got {jobs}, {preset.time_limit}.")
+    if (options.backend == "dask") != (options.scheduler is not None):
+        raise ValueError(
+            "Expected --backend dask and --scheduler ADDRESS together, got "
+            f"--backend {options.backend} and the scheduler {options.scheduler}."
+        )
     folder = (options.output or default_output(options.preset)).resolve()
     entries = plan.select_entries(options.methods, options.preset)
     environments = plan.select_environments(options.envs or preset.environments)
     cells = plan.make_cells(entries, environments, preset)
-    to_do = [c for c in cells if options.force or not plan.is_up_to_date(c, folder)]
     folder.mkdir(parents=True, exist_ok=True)
 
     began = time.monotonic()
-    with Reporter(console, len(to_do)) as reporter:
-        reporter.line(
-            f"{len(cells)} cells, {len(cells) - len(to_do)} up to date, {len(to_do)} to do by "
-            f"{min(jobs, max(len(to_do), 1))} workers, into {folder}"
-        )
-        for name, count in plan.not_learned(entries, environments).items():
-            reporter.line(f"{name}: not applicable to {count} of {len(environments)} environments")
-        Pool(folder, jobs, reporter.event).run(plan.make_jobs(cells, to_do))
-    results = [read_result(folder / cell.path) for cell in cells]
+    spent = Spent()
+    with output_lock(folder):
+        sweep(folder)
+        broken = [text for cell in cells if (text := plan.what_is_broken(cell, folder)) is not None]
+        to_do = [c for c in cells if options.force or not plan.is_up_to_date(c, folder)]
+        with Reporter(console, len(to_do)) as reporter:
+
+            def on_event(event: dict[str, Any]) -> None:
+                spent.event(event)
+                reporter.event(event)
+
+            workers = f"{min(jobs, max(len(to_do), 1))} workers"
+            if options.scheduler is not None:
+                workers = f"the workers of {options.scheduler}"
+            reporter.line(
+                f"{len(cells)} cells, {len(cells) - len(to_do)} up to date, {len(to_do)} to do by "
+                f"{workers}, into {folder}"
+            )
+            for text in broken:
+                reporter.line(f"Done again: {text}")
+            for name, count in plan.not_learned(entries, environments).items():
+                reporter.line(
+                    f"{name}: not applicable to {count} of {len(environments)} environments"
+                )
+            _run(options, folder, jobs, on_event, plan.make_jobs(cells, to_do))
+        results = [read_result(folder / cell.path) for cell in cells]
     console.print(summary(results))
+    if spent.methods:
+        console.print(spent.table())
     failed = [result for result in results if not result.ok]
     for result in failed:
         reporter.line(f"FAILED {result.path}: {(result.reason or '').splitlines()[0]}")
+    seconds = time.monotonic() - began
     reporter.line(
-        f"{len(to_do)} cells in {time.monotonic() - began:.0f} s, {len(failed)} failed. "
+        f"{len(to_do)} cells in {seconds:.0f} s, {len(failed)} failed. "
         f"Now build the tables: python leaderboard/build.py --results {folder} --output <folder>"
     )
+    if options.json is not None:
+        said = {
+            "preset": options.preset,
+            "backend": options.backend,
+            "workers": jobs if options.scheduler is None else None,
+            "cells": len(cells),
+            "up_to_date": len(cells) - len(to_do),
+            "failed": len(failed),
+            "wall_seconds": seconds,
+            "methods": spent.methods,
+        }
+        options.json.write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
     return 1 if failed else 0
+
+
+def _run(
+    options: RunOptions,
+    folder: Path,
+    jobs: int,
+    on_event: Callable[[dict[str, Any]], object],
+    to_do: Sequence[Job],
+) -> None:
+    """Do jobs where the options say."""
+    if options.scheduler is None:
+        from iflow_gym.baselines.runner.pool import Pool
+
+        Pool(folder, jobs, on_event).run(to_do)
+    elif to_do:
+        from iflow_gym.baselines.runner.cluster import Cluster
+
+        Cluster(folder, options.scheduler, on_event).run(to_do)
 
 
 def default_output(preset: str) -> Path:
@@ -146,7 +225,29 @@ def main() -> None:
     except ValueError as error:
         print(f"run_all.py: {error}", file=sys.stderr)
         status = 2
+    except (RuntimeError, OSError) as error:
+        text = _why_it_ended(error)
+        if text is None:
+            raise
+        print(f"run_all.py: {text}", file=sys.stderr)
+        status = 3
     sys.exit(status)
+
+
+def _why_it_ended(error: RuntimeError | OSError) -> str | None:
+    """Say what kept a run from going on; None for an error that has to be looked into."""
+    from iflow_gym.baselines.runner.cluster_errors import ClusterError
+    from iflow_gym.baselines.runner.lock import FolderInUseError
+    from iflow_gym.baselines.runner.store import CannotWriteError, no_room
+
+    if isinstance(error, CannotWriteError) or no_room(error):
+        return (
+            f"Results cannot be written ({error}): make room and run again. "
+            "What is done is kept; the next run goes on from there."
+        )
+    if isinstance(error, FolderInUseError | ClusterError):
+        return str(error)
+    return None
 
 
 def _stop(signal_number: int, frame: object) -> NoReturn:

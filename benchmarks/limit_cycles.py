@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from iflow_gym import Demonstrations
 from iflow_gym.baselines.imitation_flow import ImitationFlow
-from iflow_gym.baselines.imitation_flow.config import CYCLE_STEPS
+from iflow_gym.baselines.imitation_flow.config import IN_PLANE
 from iflow_gym.classification import TrajectoryClassifier, varied
 from iflow_gym.datasets.letters import load_letter
 from iflow_gym.demonstrations import FloatArray
@@ -47,7 +47,7 @@ class Options:
     """By name."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """One table a seed."""
-    n_steps: int = CYCLE_STEPS
+    n_steps: int = IN_PLANE.n_steps
     """Steps of Adam."""
     classify: bool = True
     """Classify the held-out recordings."""

@@ -175,13 +175,13 @@ def _boxes(
             ax.annotate(
                 f"+ {missing} not finite or failed", (1.0, place), xytext=(-4, 11), ha="right",
                 va="center", xycoords=("axes fraction", "data"), textcoords="offset points",
-                fontsize=7.5, color=style.colour,
+                fontsize=7.5, color=INK,
             )  # fmt: skip
     ax.set_yticks(range(len(styles)), [style.title for style in styles.values()])
     ax.set_ylim(len(styles) - 0.45, -0.55)
     ax.set_title(label, fontsize=10, color=INK, loc="left")
     _scale(ax.xaxis, np.concatenate([*drawn, np.empty(0)]))
-    _clean(ax, grid="x")
+    clean(ax, grid="x")
 
 
 @dataclass(frozen=True)
@@ -254,8 +254,8 @@ def scatter_figure(
     ax.margins(x=0.12, y=0.14)
     for axis, is_log in ((ax.xaxis, x_log), (ax.yaxis, y_log)):
         if is_log:
-            _plain_log_ticks(axis)
-    _clean(ax, grid="both")
+            plain_log_ticks(axis)
+    clean(ax, grid="both")
     kinds = [k for k in MARKERS if any(styles[p.method].guarantee == k for p in kept)]
     handles = [
         Line2D([], [], marker=MARKERS[k], linestyle="none", color=INK, markersize=7) for k in kinds
@@ -310,8 +310,7 @@ def _place_labels(
                 ha=("right", "center", "left")[aside + 1],
                 va=("top", "center", "bottom")[up + 1],
                 fontsize=9.5,
-                color=style.colour,
-                fontweight="bold",
+                color=INK,
                 arrowprops=(
                     None
                     if distance <= 20
@@ -330,7 +329,7 @@ def _place_labels(
         else:
             ax.annotate(
                 style.title, (x, y), xytext=(10, 0), textcoords="offset points", va="center",
-                fontsize=9.5, color=style.colour, fontweight="bold",
+                fontsize=9.5, color=INK,
             )  # fmt: skip
 
 
@@ -505,10 +504,10 @@ def _scale(axis: Any, values: FloatArray) -> None:
         return
     if math.log10(positive.max() / positive.min()) > TOLERABLE_DECADES:
         axis.axes.set_xscale("log")
-        _plain_log_ticks(axis)
+        plain_log_ticks(axis)
 
 
-def _plain_log_ticks(axis: Any) -> None:
+def plain_log_ticks(axis: Any) -> None:
     """Label 1, 2 and 5 of each decade as plain numbers; powers of ten where there are many."""
     low, high = axis.get_view_interval()
     decades = math.log10(high / low)
@@ -519,7 +518,8 @@ def _plain_log_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _clean(ax: Axes, *, grid: str) -> None:
+def clean(ax: Axes, *, grid: str) -> None:
+    """Give axes the look of all figures: pale grid lines along "x", "y" or "both", no box."""
     ax.set_axisbelow(True)
     ax.grid(axis=grid, color="#e6e2d8", linewidth=0.8)  # type: ignore[arg-type]
     for side in ("top", "right"):

@@ -181,19 +181,35 @@ def write_result(folder: str | os.PathLike[str], result: Result) -> Path:
     """
     target = Path(folder) / result.path
     target.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(
-        _encoded(dataclasses.asdict(result)), sort_keys=True, indent=1, allow_nan=False
-    )
-    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole({target: result_text(result).encode()})
     return target
+
+
+def result_text(result: Result) -> str:
+    """Return the text of a record's file; raise what JSON raises for what it cannot hold."""
+    values = _encoded(dataclasses.asdict(result))
+    return json.dumps(values, sort_keys=True, indent=1, allow_nan=False) + "\n"
+
+
+def write_whole(contents: Mapping[Path, bytes]) -> None:
+    """Write files whose folders exist, all of them or, where one cannot be written, none.
+
+    Neighbours ending in ``.partial`` are written, brought to the disk and renamed.
+    """
+    partials = {
+        target: target.with_name(f"{target.name}.{os.getpid()}.partial") for target in contents
+    }
+    try:
+        for target, content in contents.items():
+            with partials[target].open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        for target, partial in partials.items():
+            partial.replace(target)
+    finally:
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)
 
 
 def read_result(path: str | os.PathLike[str]) -> Result:

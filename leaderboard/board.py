@@ -58,6 +58,20 @@ RANKED: dict[Motion, tuple[str, ...]] = {
 }
 """Metrics whose ranks the mean rank is the mean of: those of the accuracy table."""
 
+MAIN: dict[Motion, str] = {
+    "goal": "frechet",
+    "cycle": "orbit_hausdorff",
+    "drumming": "rhythm_f1",
+}
+"""The accuracy that figures and tests of one number are of."""
+
+HOLDS: dict[Motion, str] = {
+    "goal": "converged",
+    "cycle": "attraction",
+    "drumming": "attraction",
+}
+"""The stability that is set against it: the share of the starts that end where they should."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -134,9 +148,17 @@ class Row:
         value = cell.metrics.get(metric) if cell is not None and cell.ok else None
         return np.nan if value is None else float(value)
 
+    @cached_property
+    def _aggregates(self) -> dict[str, Aggregate | None]:
+        return {}
+
     def aggregate(self, metric: str) -> Aggregate | None:
         """Return a metric over all cells; None where it does not apply to the method."""
-        return aggregate_scores(self.scores(metric)) if self.applies(metric) else None
+        if metric not in self._aggregates:  # the bootstrap is what takes the time
+            self._aggregates[metric] = (
+                aggregate_scores(self.scores(metric)) if self.applies(metric) else None
+            )
+        return self._aggregates[metric]
 
     def reward(self) -> Aggregate | None:
         """Return the mean reward a step over all cells; None unless every scored cell has one."""

@@ -1,70 +1,76 @@
-"""Build the leaderboard: read the records of a folder of results, write tables and figures.
+"""Build the leaderboard: read the records of a folder of results, write tables, figures, a page.
 
     python leaderboard/build.py
     python leaderboard/build.py --results results/smoke --output results/smoke-board
+    python leaderboard/build.py --check
 
-Exit status: 0 when it is written, 2 when there is nothing to build it of.
+Written are LEADERBOARD.md with its figures, for a forge, and index.html, which holds everything in
+one file, for a browser. With `--check` nothing is written: what the records say is compared with
+the words and numbers of both files, pictures aside.
+
+Exit status: 0 when it is written, or as it should be; 1 when a check found a difference; 2 when
+there is nothing to build it of.
 """
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import gymnasium
-import numpy as np
-from board import Board, Row, make_boards
-from classes import confusion
+import web
+from board import Board, make_boards
+from drawings import Drawing, drawings_of, units_of
 from matplotlib.figure import Figure
-from page import HEADLINE, render
-from tables import heading, shape_name
+from page import render
 
-import iflow_gym  # noqa: F401 (registers the environments)
-from iflow_gym.baselines.registry import METHODS, load_method
-from iflow_gym.demonstrations import Demonstrations
-from iflow_gym.figures import (
-    USES_TIME,
-    FieldPanel,
-    MethodStyle,
-    Point,
-    box_figure,
-    confusion_figure,
-    field_sheet,
-    method_styles,
-    save_figure,
-    scatter_figure,
-)
+from iflow_gym.figures import save_figure
 from iflow_gym.results import Result, ResultFileError, read_results
-from iflow_gym.system import GUARANTEE_KINDS, Method
 
 HERE = Path(__file__).resolve().parent
 
 FIGURES = "figures"
 """Folder of the figures, beside the page."""
 
-BOXES = ("seds_error", "frechet", "swept_area", "dtw")
-"""Metrics of the ImitationFlow paper's figure 3."""
-
-SHEET_METHOD = "imitation-flow"
-"""Method that every shape is shown of."""
-
-COMPARED_SHAPE = "Sshape"
-"""Shape that every method is shown on."""
-
-REFERENCE = "nearest-demonstration"
-"""Row that figures mark with a dashed line."""
+SHOWN_DIFFERENCES = 30
+"""Lines of a difference that a check prints."""
 
 
 class NothingToBuildError(ValueError):
     """There are no records to build a leaderboard of."""
 
 
-def build(results_folder: Path, output: Path) -> list[Path]:
-    """Write LEADERBOARD.md and its figures into a folder, and return their paths.
+@dataclass(frozen=True)
+class Plan:
+    """All that the files are made of, before anything is drawn."""
+
+    results: Sequence[Result]
+    boards: Sequence[Board]
+    units: Mapping[str, str]
+    drawings: Mapping[str, Drawing]
+
+    @property
+    def paths(self) -> dict[str, str]:
+        """Where figures lie, relative to LEADERBOARD.md."""
+        return {name: f"{FIGURES}/{name}{d.suffix}" for name, d in self.drawings.items()}
+
+    def markdown(self) -> str:
+        """Return LEADERBOARD.md."""
+        return render(self.boards, self.results, self.paths, self.units)
+
+    def html(self, output: Path, figures: Mapping[str, Figure]) -> str:
+        """Return index.html for a folder; without figures, the page without pictures."""
+        return web.render(
+            self.boards, self.results, self.units, output, drawings=self.drawings, figures=figures
+        )
+
+
+def plan(results_folder: Path) -> Plan:
+    """Read the records and say what is to be written.
 
     Raises
     ------
@@ -82,259 +88,49 @@ def build(results_folder: Path, output: Path) -> list[Path]:
             f"--output {results_folder}` first."
         )
     boards = make_boards(results)
+    return Plan(results, boards, units_of(boards), drawings_of(boards, results_folder))
+
+
+def build(results_folder: Path, output: Path) -> list[Path]:
+    """Write LEADERBOARD.md, its figures and index.html into a folder, and return their paths.
+
+    Raises as `plan` does.
+    """
+    planned = plan(results_folder)
     folder = output / FIGURES
     folder.mkdir(parents=True, exist_ok=True)
-    written: list[Path] = []
-    paths: dict[str, str] = {}
-    for name, (figure, suffix) in draw(boards, results_folder).items():
-        written.append(save_figure(figure, folder / f"{name}{suffix}"))
-        paths[name] = f"{FIGURES}/{name}{suffix}"
-    page = output / "LEADERBOARD.md"
-    page.write_text(
-        render(boards, results, paths, units_of(boards)), encoding="utf-8", newline="\n"
-    )
-    return [page, *written]
-
-
-def units_of(boards: Iterable[Board]) -> dict[str, str]:
-    """Return each family's unit of length, as its environments' demonstrations have it."""
-    units: dict[str, str] = {}
-    for board in boards:
-        demonstrations = demonstrations_of(board.environments[0])
-        units[board.family] = "length" if demonstrations is None else demonstrations.length_unit
-    return units
-
-
-def demonstrations_of(environment: str) -> Demonstrations | None:
-    """Return an environment's demonstrations; None for one that is not installed here."""
-    try:
-        env: Any = gymnasium.make(environment).unwrapped
-    except (gymnasium.error.Error, FileNotFoundError):
-        return None
-    return getattr(env, "demonstrations", None)
-
-
-# Figures ------------------------------------------------------------------------------------
-
-
-def draw(boards: Iterable[Board], results_folder: Path) -> dict[str, tuple[Figure, str]]:
-    """Return the figures by name, each with the suffix of its file."""
-    by_key = {(board.family, board.protocol): board for board in boards}
-    return _headline_figures(by_key, results_folder) | _cycle_figures(by_key, results_folder)
-
-
-def _cycle_figures(
-    by_key: Mapping[tuple[str, str], Board], results_folder: Path
-) -> dict[str, tuple[Figure, str]]:
-    """Return every motion by every method, and which motion is taken for which."""
-    figures: dict[str, tuple[Figure, str]] = {}
-    for (family, protocol), board in by_key.items():
-        if board.motion != "cycle":
-            continue
-        if protocol == "generalisation":
-            found = {row.title: confusion(row) for row in board.methods}
-            counts = {title: matrix for title, matrix in found.items() if matrix is not None}
-            if counts:
-                labels = [shape_name(environment) for environment in board.environments]
-                figures[f"{family}-classes"] = (confusion_figure(counts, labels), ".svg")
-            continue
-        panels = [
-            panel
-            for environment in board.environments
-            for row in board.methods
-            if (panel := panel_of(row, environment, row.title, results_folder)) is not None
-        ]
-        if any(panel.system is not None for panel in panels):
-            sheet = field_sheet(panels, n_columns=len(board.methods), size=2.2)
-            figures[f"{family}-fields"] = (sheet, ".png")
-    return figures
-
-
-def _headline_figures(
-    by_key: Mapping[tuple[str, str], Board], results_folder: Path
-) -> dict[str, tuple[Figure, str]]:
-    """Return the figures of the headline family's reproduction board; none where it has not run."""
-    board = by_key.get((HEADLINE, "reproduction"))
-    if board is None or not any(row.n_scored for row in board.competitors):
-        return {}
-    styles = styles_of(board)
-    unit = units_of([board])[board.family]
-    figures = {
-        "accuracy-stability": (accuracy_stability(board, styles, unit), ".svg"),
-        "accuracy-fit-time": (accuracy_fit_time(board, styles, unit), ".svg"),
-        "boxes": (boxes(board, styles, unit), ".svg"),
-    }
-    every_shape = [
-        b for key in (HEADLINE, "LASA-Multi") if (b := by_key.get((key, "reproduction")))
+    figures = {name: drawing.make() for name, drawing in planned.drawings.items()}
+    written = [
+        save_figure(figure, folder / f"{name}{planned.drawings[name].suffix}")
+        for name, figure in figures.items()
     ]
-    sheets = {
-        "methods": (method_panels(board, results_folder), 3.0),
-        "fields": (shape_panels(every_shape, results_folder), 1.9),
+    pages = {
+        output / "LEADERBOARD.md": planned.markdown(),
+        output / web.NAME: planned.html(output, figures),
     }
-    for name, (panels, size) in sheets.items():
-        if any(panel.system is not None for panel in panels):
-            columns = 6 if name == "fields" else 4
-            figures[name] = (field_sheet(panels, n_columns=columns, size=size), ".png")
-    return figures
+    for path, text in pages.items():
+        path.write_text(text, encoding="utf-8", newline="\n")
+    return [*pages, *written]
 
 
-def styles_of(board: Board) -> dict[str, MethodStyle]:
-    """Return the methods' styles, in the board's order."""
-    methods = {
-        row.method: (row.title, USES_TIME if row.uses_time else weakest(row))
-        for row in board.methods
-        if row.n_scored
-    }
-    return method_styles(methods, order=tuple(METHODS))
+def check(results_folder: Path, output: Path) -> list[str]:
+    """Return the lines by which what is written differs from what the records say, as a diff.
 
-
-def weakest(row: Row) -> str:
-    """Return the weakest kind of guarantee that a row's cells state."""
-    return row.guarantees[0] if row.guarantees else GUARANTEE_KINDS[0]
-
-
-def reference_median(board: Board, metric: str) -> float | None:
-    """Return the median over the shapes of the distance between the demonstrations."""
-    for row in board.rows:
-        if row.method == REFERENCE and row.applies(metric):
-            return float(np.nanmedian(row.by_environment(metric)))
-    return None
-
-
-def accuracy_stability(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
-    """Fréchet distance against the share of starts that converge."""
-    points = []
-    for row in _drawn(board, styles):
-        x, y = row.aggregate("frechet"), row.aggregate("converged")
-        if x is not None and y is not None:
-            low, high = y.mean_interval
-            points.append(
-                Point(row.method, x.iqm, 100 * y.mean, x.iqm_interval, (100 * low, 100 * high))
-            )
-    between = reference_median(board, "frechet")
-    return scatter_figure(
-        points,
-        styles,
-        x_label=f"Fréchet distance ({unit}), interquartile mean",
-        y_label="starts that converge (%), mean",
-        x_log=True,
-        y_limits=(-9.0, 116.0),  # room for names above and below the points
-        references=None if between is None else {"between demonstrations": between},
-    )
-
-
-def accuracy_fit_time(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
-    """Time to fit against Fréchet distance."""
-    points = []
-    for row in _drawn(board, styles):
-        x, y = row.aggregate("fit_seconds"), row.aggregate("frechet")
-        if x is not None and y is not None:
-            points.append(Point(row.method, x.iqm, y.iqm, x.iqm_interval, y.iqm_interval))
-    return scatter_figure(
-        points,
-        styles,
-        x_label="time to fit a shape (s), interquartile mean",
-        y_label=f"Fréchet distance ({unit}), interquartile mean",
-        x_log=True,
-        y_log=True,
-    )
-
-
-def boxes(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
-    """Four metrics, a box over the shapes for each method."""
-    references = {
-        heading(metric, unit): value
-        for metric in BOXES
-        if (value := reference_median(board, metric)) is not None
-    }
-    panels = {
-        heading(metric, unit): {
-            row.method: np.array([v for v, ran in _tried(row, metric) if ran])
-            for row in _drawn(board, styles)
-            if row.applies(metric)  # what has no field has no box for it, and has not failed
-        }
-        for metric in BOXES
-    }
-    return box_figure(
-        panels, styles, references, reference_label="between demonstrations (median over shapes)"
-    )
-
-
-def _drawn(board: Board, styles: Mapping[str, MethodStyle]) -> list[Row]:
-    return [row for row in board.methods if row.method in styles]
-
-
-def _tried(row: Row, metric: str) -> list[tuple[float, bool]]:
-    """Return each environment's score and whether the method was run there at all."""
-    ran = {environment for environment, _ in row.cells}
-    scores = row.by_environment(metric)
-    return [(float(v), e in ran) for v, e in zip(scores, row.environments, strict=True)]
-
-
-def shape_panels(boards: Iterable[Board], results_folder: Path) -> list[FieldPanel]:
-    """Return a panel for each shape of `SHEET_METHOD`; none where it was not run."""
-    panels = []
-    for board in boards:
-        for row in board.rows:
-            if row.method == SHEET_METHOD:
-                panels += [
-                    panel_of(row, e, shape_name(e), results_folder) for e in row.environments
-                ]
-    return [panel for panel in panels if panel is not None]
-
-
-def method_panels(board: Board, results_folder: Path) -> list[FieldPanel]:
-    """Return a panel for each method on `COMPARED_SHAPE`."""
-    environments = [e for e in board.environments if shape_name(e) == COMPARED_SHAPE]
-    panels = [
-        panel_of(row, environment, row.title, results_folder)
-        for environment in environments
-        for row in board.methods
-    ]
-    return [panel for panel in panels if panel is not None]
-
-
-def panel_of(row: Row, environment: str, title: str, results_folder: Path) -> FieldPanel | None:
-    """Return the picture of a method's first seed on an environment; None where it has no data."""
-    demonstrations = demonstrations_of(environment)
-    if demonstrations is None or demonstrations.n_dims != 2:
-        return None
-    cell = row.cells.get((environment, row.seeds[0]))
-    if cell is None:
-        return FieldPanel(title, demonstrations, None, "never run")
-    if not cell.ok:
-        return FieldPanel(title, demonstrations, None, "failed")
-    system, problem = load_model(cell, results_folder)
-    return FieldPanel(title, demonstrations, system, problem)
-
-
-def load_model(cell: Result, results_folder: Path) -> tuple[Method | None, str]:
-    """Return the fitted model beside a record, or None, and in a few words why there is none.
-
-    A method that is not in the registry is imported by the ``module:Class`` that the record names.
+    Raises as `plan` does.
     """
-    if cell.model is None:
-        return None, "no model file"
-    path = results_folder / cell.path.parent / cell.model
-    if not path.is_file():
-        return None, "no model file"
-    target = cell.method if cell.method in METHODS else cell.target
-    try:
-        if target is None:
-            return None, "unknown method"
-        method = load_method(target)
-    except Exception as error:  # whatever a module does on import
-        _complain(path, error)
-        return None, f"{target}\nis not importable"
-    try:
-        return method.load(path), ""
-    except Exception as error:  # ModelFileError, and whatever a method's own code raises
-        _complain(path, error)
-        return None, "no usable model file"
-
-
-def _complain(path: Path, error: Exception) -> None:
-    print(f"build.py: no picture of {path.name}: {error}", file=sys.stderr)
+    planned = plan(results_folder)
+    found: list[str] = []
+    for name, made in (
+        ("LEADERBOARD.md", planned.markdown()),
+        (web.NAME, planned.html(output, {})),
+    ):
+        path = output / name
+        there = path.read_text(encoding="utf-8") if path.is_file() else ""
+        if name == web.NAME:
+            there, made = web.without_pictures(there), web.without_pictures(made)
+        lines = (there.splitlines(), made.splitlines())
+        found += difflib.unified_diff(*lines, f"{name} as it is", f"{name} of the records", n=0)
+    return [line.rstrip("\n") for line in found]
 
 
 def main() -> int:
@@ -343,11 +139,16 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--results", type=Path, default=HERE / "results", help="folder of records")
-    parser.add_argument("--output", type=Path, default=HERE, help="where the page is written")
+    parser.add_argument("--output", type=Path, default=HERE, help="where the pages are written")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; compare what is written"
+    )
     options = parser.parse_args()
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # for the models of methods that are not in the registry
     try:
+        if options.check:
+            return _report(check(options.results, options.output))
         written = build(options.results, options.output)
     except (FileNotFoundError, NothingToBuildError, ResultFileError) as error:
         print(f"build.py: {error}", file=sys.stderr)
@@ -355,6 +156,21 @@ def main() -> int:
     for path in written:
         print(path)
     return 0
+
+
+def _report(difference: Sequence[str]) -> int:
+    if not difference:
+        return 0
+    for line in difference[:SHOWN_DIFFERENCES]:
+        print(line if len(line) <= 300 else f"{line[:300]} ...", file=sys.stderr)
+    if (more := len(difference) - SHOWN_DIFFERENCES) > 0:
+        print(f"... and {more} more lines", file=sys.stderr)
+    print(
+        "build.py: what is written is not what the records say: run `python leaderboard/build.py` "
+        "and commit the result.",
+        file=sys.stderr,
+    )
+    return 1
 
 
 if __name__ == "__main__":

@@ -6,8 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import get_args
 
-from board import RANKED, Board, motion_of
+from board import MAIN, RANKED, Board, motion_of
 from classes import confusion, fraction_right
+from comparisons import compared, improvements, rank_comparison
 from tables import (
     BY_MEAN,
     Aggregates,
@@ -28,6 +29,7 @@ from tables import (
 from iflow_gym.baselines.registry import METHODS, REFERENCES
 from iflow_gym.metrics import METRICS, Motion, get_metric, metrics_hash, metrics_of
 from iflow_gym.results import Result
+from iflow_gym.statistics import Improvement, RankComparison
 
 ACCURACY = RANKED
 """Columns of the accuracy tables."""
@@ -305,6 +307,9 @@ def render(
         "marked *uses time* follow a clock that was started with the motion: they are no field, so "
         "that what is asked of a field is – there, and are no competitors either.",
         "",
+        "The same in one page to sort, filter and look into, with every score of every motion: "
+        "[`index.html`](index.html), for a browser.",
+        "",
         "Written by `python leaderboard/build.py` from the records in "
         "[`results/`](results); do not edit.",
         "",
@@ -315,6 +320,7 @@ def render(
         full = board.family not in BESIDE
         page += board_section(board, units.get(board.family, "length"), full=full)
         if board.family == HEADLINE and board.protocol == "reproduction":
+            page += comparison_section(board, figures)
             page += _pictures(figures, ("boxes", "accuracy-fit-time", "methods", "fields"))
         if board.protocol == "generalisation":
             page += _pictures(figures, (f"{board.family}-classes",))
@@ -326,7 +332,72 @@ def render(
     return "\n".join(page).rstrip() + "\n"
 
 
+def comparison_section(board: Board, figures: Mapping[str, str]) -> list[str]:
+    """Return which competitors can be told apart, and how sure that is."""
+    found = improvements(board)
+    if not found:
+        return []
+    title = get_metric(MAIN[board.motion]).title
+    page = [f"### Differences between methods, by {title}", ""]
+    if (comparison := rank_comparison(board)) is not None:
+        page += [ranks_in_words(comparison), "", *_pictures(figures, ("ranks",))]
+    rows = compared(board)
+    page += [improvement_in_words(found), ""]
+    lines = [
+        [
+            escaped(one.title),
+            *(
+                "" if one is other else percent_of(found[one.method, other.method])
+                for other in rows
+            ),
+        ]
+        for one in rows
+    ]
+    page += table(["Method", *(escaped(row.title) for row in rows)], lines)
+    return page + _pictures(figures, ("profile",))
+
+
+def percent_of(found: Improvement) -> str:
+    """Return a probability of improvement in percent, its interval below it."""
+    low, high = (f"{100 * end:.0f}" for end in found.interval)
+    text = f"{100 * found.probability:.0f}"
+    return text if low == high or "nan" in low else f"{text}<br><sub>{low} to {high}</sub>"
+
+
+def ranks_in_words(comparison: RankComparison) -> str:
+    """Say what the tests of ranks say."""
+    p = comparison.p_value
+    return (
+        f"Friedman's test over {comparison.n_environments} environments, the mean over the seeds "
+        f"in each (seeds are no data sets of their own): chi² = {comparison.statistic:.1f}, "
+        f"p {'< 0.001' if p < 0.001 else f'= {p:.3f}'}. Mean ranks further apart than "
+        f"{comparison.critical_difference:.2f} differ by Nemenyi's test at "
+        f"{100 * comparison.alpha:.0f} % (Demšar 2006)."
+    )
+
+
+def improvement_in_words(found: Mapping[tuple[str, str], Improvement]) -> str:
+    """Say what the table of probabilities is."""
+    drawn = {entry.resampled for entry in found.values()} - {"nothing"}
+    what = {
+        "seeds": "resample the seeds within each environment where a method of the pair has "
+        "several",
+        "environments": "resample the environments where neither has",
+    }
+    said = " and ".join(what[name] for name in ("seeds", "environments") if name in drawn)
+    return (
+        "Probability (%) that a run of the row's method is better than one of the column's on an "
+        "environment drawn at random, a tie counting half and a failed cell as the worst (Agarwal "
+        "et al. 2021)" + (f"; 95 % bootstrap intervals {said}." if said else ".")
+    )
+
+
 CAPTIONS = {
+    "ranks": "Mean ranks over the environments, 1 is best: methods under one bar cannot be told "
+    "apart at 5 %.",
+    "profile": "Share of a method's cells that are as good as the value on the x axis or better; a "
+    "curve further up and to the left is better, and what failed keeps it below 100 %. Bands are "
+    "95 % bootstrap intervals.",
     "accuracy-stability": "Accuracy against stability on LASA-26, reproduction: to the upper left "
     "a method follows the demonstrations and ends where they end. Bars are 95 % intervals.",
     "boxes": "The four measures of the ImitationFlow paper's figure 3 over the LASA-26 shapes, a "

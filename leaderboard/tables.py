@@ -6,6 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 from board import Board, Row
 
@@ -146,26 +147,11 @@ def aggregate_table(
     references
         Whether rows that do not compete are in it.
     """
-    columns: list[dict[str, str]] = []
+    columns = []
     for metric in metrics:
-        chosen = statistic or ("mean" if metric in BY_MEAN else "iqm")
-        values = {
-            row.method: getattr(aggregate, chosen)
-            for row in board.rows
-            if (aggregate := found[row.method, metric]) is not None
-        }
-        best = {shown(metric, values[name]) for name in board.best(values, metric)}
-        eligible = eligible_methods(board)
-        column = {}
-        for row in board.rows:
-            aggregate = found[row.method, metric]
-            text = "–" if aggregate is None else shown(metric, getattr(aggregate, chosen))
-            if row.method in eligible and text in best:
-                text = f"**{text}**"
-            if aggregate is not None:
-                text += interval(metric, getattr(aggregate, f"{chosen}_interval"), text)
-            column[row.method] = text
-        columns.append(column)
+        chosen = statistic or statistic_of(metric)
+        entries = entries_of(board, found, metric, chosen)
+        columns.append({name: _marked(entry) for name, entry in entries.items()})
     before = extra or {}
     header = ["Method", *before, *(heading(metric, length_unit) for metric in metrics)]
     lines = [
@@ -181,6 +167,52 @@ def aggregate_table(
         if references or not row.reference
     ]
     return table(header, lines)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of a table."""
+
+    value: float
+    """nan where there is none."""
+    text: str
+    interval: str
+    """Its ends, as "1 to 2"; nothing where there are none, or they are the number itself."""
+    best: bool
+    """Whether it is the best of those that compete, as it is shown."""
+
+
+def statistic_of(metric: str) -> str:
+    """Return which statistic a metric is shown by, "mean" or "iqm"."""
+    return "mean" if metric in BY_MEAN else "iqm"
+
+
+def entries_of(board: Board, found: Aggregates, metric: str, statistic: str) -> dict[str, Entry]:
+    """Return a column by method; what is shown alike with the best is best, too."""
+    values = {
+        row.method: float(getattr(aggregate, statistic))
+        for row in board.rows
+        if (aggregate := found[row.method, metric]) is not None
+    }
+    best = {shown(metric, values[name]) for name in board.best(values, metric)}
+    eligible = eligible_methods(board)
+    entries = {}
+    for row in board.rows:
+        aggregate = found[row.method, metric]
+        if aggregate is None:
+            entries[row.method] = Entry(math.nan, "–", "", False)
+            continue
+        text = shown(metric, values[row.method])
+        ends = interval(metric, getattr(aggregate, f"{statistic}_interval"), text)
+        is_best = row.method in eligible and text in best
+        entries[row.method] = Entry(values[row.method], text, ends, is_best)
+    return entries
+
+
+def _marked(entry: Entry) -> str:
+    """Return a number in Markdown, its interval below it."""
+    text = f"**{entry.text}**" if entry.best else entry.text
+    return f"{text}<br><sub>{entry.interval}</sub>" if entry.interval else text
 
 
 def reward_of(row: Row) -> str:
@@ -219,11 +251,9 @@ def eligible_methods(board: Board) -> set[str]:
 
 
 def interval(metric: str, ends: Interval, value: str) -> str:
-    """Return an interval for below its number; nothing where it is none, or the number itself."""
+    """Return an interval's ends; nothing where it is none, or the number itself."""
     low, high = (shown(metric, end) for end in ends)
-    if "–" in (low, high) or low == high == value.strip("*"):
-        return ""
-    return f"<br><sub>{low} to {high}</sub>"
+    return "" if "–" in (low, high) or low == high == value else f"{low} to {high}"
 
 
 def emphasised(row: Row, cells: Sequence[str]) -> list[str]:

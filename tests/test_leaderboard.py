@@ -1,7 +1,5 @@
 """The leaderboard: what it says of results that are made up, so that the truth is known."""
 
-import importlib
-import importlib.util
 import math
 import subprocess
 import sys
@@ -9,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from leaderboard_records import failed, record, sweep
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
@@ -22,66 +21,12 @@ from iflow_gym.figures import (
     save_figure,
     scatter_figure,
 )
-from iflow_gym.metrics import metrics_hash, metrics_of
+from iflow_gym.metrics import metrics_hash
 from iflow_gym.plotting import GOAL
-from iflow_gym.registration import lasa_id
-from iflow_gym.results import Result, write_result
+from iflow_gym.results import write_result
 from iflow_gym.system import Guarantee
 
 LEADERBOARD = Path(__file__).parents[1] / "leaderboard"
-
-
-@pytest.fixture(scope="module")
-def builder():
-    """leaderboard/build.py, as the script finds its neighbours, under a name of its own."""
-    sys.path.insert(0, str(LEADERBOARD))
-    try:
-        spec = importlib.util.spec_from_file_location("_leaderboard", LEADERBOARD / "build.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        module.tables = importlib.import_module("tables")
-    finally:
-        sys.path.remove(str(LEADERBOARD))
-    return module
-
-
-def record(method, shape, scale=1.0, **changes):
-    """Return a record whose every score is `scale` times a number that depends on the shape."""
-    shapes = [*SINGLE_MOTIONS, *MULTI_MODELS]
-    value = scale * (1 + shapes.index(shape) / 10)
-    metrics = {m.name: value for m in metrics_of("goal")} | {"converged": min(1.0, 1 / scale)}
-    metrics |= {"diverged": 0.0, "perturbation_recovery": 0.5, "lyapunov_violation": None}
-    fields = {
-        "method": method,
-        "title": method.capitalize(),
-        "environment": lasa_id(shape),
-        "family": "LASA-26" if shape in SINGLE_MOTIONS else "LASA-Multi",
-        "protocol": "reproduction",
-        "seed": 0,
-        "preset": "standard",
-        "status": "ok",
-        "key": "k",
-        "created": "2026-01-02T03:04:05+00:00",
-        "metrics": metrics,
-        "guarantee": Guarantee("proved", "made up for a test"),
-        "integrator": "exact",
-        "dt": 0.005,
-        "fit": {"batch_size": 1},
-        "hashes": {"metrics": metrics_hash("goal"), "core": "c", "data": shape},
-        "versions": {"python": "3.12", "numpy": "2.0"},
-        "hardware": {"cpu": "abacus", "cores": 2, "threads": 1, "platform": "wood"},
-    }
-    return Result(**{**fields, **changes})
-
-
-def failed(method, shape, reason="RuntimeError: it | broke\nfile.py:1", **changes):
-    return record(
-        method, shape, status="failed", reason=reason, metrics={}, guarantee=None, **changes
-    )
-
-
-def sweep(method, scale=1.0, shapes=SINGLE_MOTIONS, **changes):
-    return [record(method, shape, scale, **changes) for shape in shapes]
 
 
 def boards_of(builder, results):
@@ -171,9 +116,9 @@ def test_what_uses_time_is_shown_and_marked_and_does_not_compete(builder):
     assert "Clock, *none*: a clock drives it." in page
     stability = rows_of(section(page, "Stability"))[1]
     assert "none" in stability["Clock<br><sub>uses time</sub>"]
-    styles = builder.styles_of(board)
+    styles = builder.drawings.styles_of(board)
     assert styles["clock"].guarantee == "none, uses time"
-    figure = builder.boxes(board, styles, "mm")
+    figure = builder.drawings.boxes(board, styles, "mm")
     assert not [t for t in figure.findobj(Text) if "not finite or failed" in t.get_text()]
 
 
@@ -219,6 +164,38 @@ def test_boards_come_in_order(builder):
         ("LASA-Multi", "reproduction"),
         ("Other", "reproduction"),
     ]
+
+
+# Comparisons --------------------------------------------------------------------------------
+
+
+def test_seeds_are_no_data_sets_of_their_own(builder):
+    """A block of the test of ranks is an environment, however many seeds there are."""
+    one = sweep("a", 1.0) + sweep("b", 2.0) + sweep("c", 3.0)
+    many = one + [r for seed in (1, 2) for m, s in (("a", 1.0), ("b", 2.0), ("c", 3.0))
+                  for r in sweep(m, s, seed=seed)]  # fmt: skip
+    found = [builder.comparisons.rank_comparison(boards_of(builder, r)[0]) for r in (one, many)]
+    assert [f.n_environments for f in found] == [26, 26]
+    assert found[0].critical_difference == found[1].critical_difference
+    assert found[1].statistic == pytest.approx(26 * 2)
+
+
+def test_few_environments_are_not_tested(builder):
+    results = [r for m in "abc" for r in sweep(m, shapes=MULTI_MODELS)]
+    (board,) = boards_of(builder, results)
+    assert builder.comparisons.rank_comparison(board) is None
+
+
+def test_a_failed_cell_loses_to_every_other(builder):
+    results = [*sweep("good", 1.0, shapes=SINGLE_MOTIONS[13:]), *sweep("bad", 2.0)]
+    results += [failed("good", s) for s in SINGLE_MOTIONS[:13]]
+    (board,) = boards_of(builder, results)
+    found = builder.comparisons.improvements(board)
+    assert found["good", "bad"].probability == 0.5
+    assert builder.comparisons.profiles(board)["good"].fraction[-1] == 0.5
+    text = section(render(builder, results), "Differences between methods")
+    header, rows = rows_of(text)
+    assert rows["Good"][header.index("Bad")].startswith("50<br><sub>")
 
 
 # Numbers ------------------------------------------------------------------------------------
@@ -440,9 +417,11 @@ def test_the_same_results_give_the_same_bytes(builder, results_folder, tmp_path)
     assert names[0] == names[1]
     assert set(names[0]) == {
         "LEADERBOARD.md",
+        "index.html",
         "accuracy-stability.svg",
         "accuracy-fit-time.svg",
         "boxes.svg",
+        "profile.svg",
         "methods.png",
     }
     for first, second in zip(*written, strict=True):
@@ -450,7 +429,7 @@ def test_the_same_results_give_the_same_bytes(builder, results_folder, tmp_path)
 
 
 def test_every_picture_of_the_page_is_there(builder, results_folder, tmp_path):
-    page, *figures = builder.build(results_folder, tmp_path / "out")
+    page, _, *figures = builder.build(results_folder, tmp_path / "out")
     text = page.read_text(encoding="utf-8")
     for figure in figures:
         assert f"(figures/{figure.name})" in text
@@ -458,7 +437,7 @@ def test_every_picture_of_the_page_is_there(builder, results_folder, tmp_path):
 
 
 def test_figures_hold_no_date(builder, results_folder, tmp_path):
-    _, *figures = builder.build(results_folder, tmp_path / "out")
+    _, _, *figures = builder.build(results_folder, tmp_path / "out")
     for figure in figures:
         if figure.suffix == ".svg":
             assert "dc:date" not in figure.read_text(encoding="utf-8")
@@ -478,7 +457,7 @@ def test_a_model_of_anyones_class_is_loaded_or_said_to_be_none(
 
     def load(**changes):
         fields = {"model": "m.safetensors", "target": "mine_module:Mine", **changes}
-        return builder.load_model(record("mine", "Sshape", **fields), folder)
+        return builder.drawings.load_model(record("mine", "Sshape", **fields), folder)
 
     loaded, problem = load()
     assert problem == ""
@@ -519,7 +498,28 @@ def test_the_script_prints_what_it_wrote(tmp_path):
     write_result(tmp_path / "results", record("good", "Multi_Models_1"))
     done = run_script("--results", tmp_path / "results", "--output", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == [str(tmp_path / "out" / "LEADERBOARD.md")]
+    assert done.stdout.split() == [
+        str(tmp_path / "out" / name) for name in ("LEADERBOARD.md", "index.html")
+    ]
+
+
+def test_a_check_finds_what_the_records_do_not_say(builder, tmp_path):
+    folder, out = tmp_path / "results", tmp_path / "out"
+    for result in sweep("good") + sweep("bad", 2.0):
+        write_result(folder, result)
+    pages = builder.build(folder, out)[:2]
+    assert builder.check(folder, out) == []
+    before = [path.stat().st_mtime_ns for path in pages]
+    write_result(folder, record("good", "Angle", 1.5))
+    difference = builder.check(folder, out)
+    assert "--- LEADERBOARD.md as it is" in difference
+    assert "--- index.html as it is" in difference
+    assert any(line.startswith("-| Good |") for line in difference)
+    assert [path.stat().st_mtime_ns for path in pages] == before
+    done = run_script("--results", folder, "--output", out, "--check")
+    assert done.returncode == 1
+    assert "run `python leaderboard/build.py`" in done.stderr
+    assert len(done.stderr.splitlines()) < 40
 
 
 # Figures ------------------------------------------------------------------------------------

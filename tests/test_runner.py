@@ -28,7 +28,7 @@ MOTIONS = ("Toy-A-v0", "Toy-B-v0", "Toy-C-v0")
 
 TOYS = '''
 """Toy motions, small, and toy methods: what a fit does depends on the files in this folder."""
-import ctypes, os, signal, time
+import ctypes, errno, os, signal, time
 from dataclasses import dataclass
 from pathlib import Path
 import gymnasium
@@ -86,6 +86,8 @@ class Toy(DynamicalSystem):
             raise KeyboardInterrupt
         if (HERE / f"exit-{shape}").exists():
             raise SystemExit(3)
+        if (HERE / f"full-{shape}").exists():
+            raise OSError(errno.ENOSPC, "No space left on device")
         if (HERE / f"mute-{shape}").exists():
             raise Mute
         if (HERE / f"grow-{shape}").exists():

@@ -14,28 +14,41 @@ MOST_LOG_SCALE = 2.0
 MOST_ERROR_POWER = 4.0
 """With more the powers of small errors are below single precision."""
 
-STEPS, CYCLE_STEPS = 5000, 1500
-"""Default of `n_steps`, where motions end and where they repeat."""
-
-SHARPNESS, CYCLE_SHARPNESS = 3.0, 1.5
-"""Default of `sharpness`, where motions end and where they repeat."""
-
 Noise = Literal["additive", "vanishing"]
 
 
 class Resolved(NamedTuple):
     """Settings whose defaults depend on the kind of motion."""
 
+    n_steps: int
+    sharpness: float
     calm_weight: float
     orbit_weight: float
+    inward_weight: float
     min_decay: float
 
 
-ENDS: Final = Resolved(calm_weight=2.5, orbit_weight=0.0, min_decay=0.05)
+ENDS: Final = Resolved(
+    n_steps=4000,
+    sharpness=3.0,
+    calm_weight=2.5,
+    orbit_weight=0.0,
+    inward_weight=0.0,
+    min_decay=0.05,
+)
 """Where motions end."""
-IN_PLANE: Final = Resolved(calm_weight=0.3, orbit_weight=0.0, min_decay=0.05)
+IN_PLANE: Final = Resolved(
+    n_steps=1500,
+    sharpness=1.5,
+    calm_weight=0.3,
+    orbit_weight=0.0,
+    inward_weight=0.0,
+    min_decay=0.05,
+)
 """Where motions repeat in the plane."""
-IN_SPACE: Final = Resolved(calm_weight=4.0, orbit_weight=0.2, min_decay=4.0)
+IN_SPACE: Final = IN_PLANE._replace(
+    calm_weight=4.0, orbit_weight=0.2, inward_weight=1.0, min_decay=4.0
+)
 """Where motions repeat in three dimensions and more."""
 
 
@@ -44,8 +57,10 @@ class ImitationFlowConfig:
     """Settings of `ImitationFlow`; lengths are in units of the motion, times in its duration."""
 
     objective: Objective = "reproduction"
-    """"reproduction": forward likelihood, then the squared error of whole reproductions.
-    "paper": the backward likelihood of Algorithm 1 and nothing else."""
+    """"reproduction": forward likelihood, then the squared error of whole reproductions; where
+    motions repeat forward likelihood and stationary density, and in space the orbit's likelihood.
+    "paper": Algorithm 1, the backward likelihood and the stationary density at the last sample.
+    Penalties on the field beside the recordings belong to the first."""
     emission: Emission = "coupling"
     """Layers of the flow: "coupling" (affine), "autoregressive" (masked, for three dimensions and
     more: the paper's for the robot), or "spline" (rational-quadratic couplings)."""
@@ -65,9 +80,9 @@ class ImitationFlowConfig:
     larger bends sharper corners and generalises less. None takes 3 where motions end and 1.5 where
     they repeat: recorded cycles are followed as well, and the field around them waves less."""
     n_steps: int | None = None
-    """Steps of Adam. None takes 5000 where motions end and 1500 where they repeat, which is one
+    """Steps of Adam. None takes 4000 where motions end and 1500 where they repeat, which is one
     stage instead of two."""
-    likelihood_fraction: float = 0.2
+    likelihood_fraction: float = 0.1
     """Share of the steps that maximise the likelihood before the reproduction error is minimised
     ("reproduction" only)."""
     likelihood_weight: float = 0.1
@@ -95,14 +110,19 @@ class ImitationFlowConfig:
     """Standard deviation of the distance to the start, in half the motion's size."""
     calm_weight: float | None = None
     """Weight of the penalty on speed away from the demonstrations. 0 leaves it out. None takes
-    2.5 where motions end, 0.3 where they repeat in the plane, and 4 where they repeat in space,
-    beside the orbit's likelihood."""
+    2.5 where motions end, 0.3 where they repeat in the plane and 4 where they repeat in three
+    dimensions and more. Where motions end the weight of a model that is still fast somewhere grows
+    until it is not, see `calm`."""
     calm_speed: float = 1.5
     """Speeds up to this multiple of the demonstrations' peak cost nothing."""
     orbit_weight: float | None = None
     """Weight of the likelihood of the whole orbit for motions that repeat, in a second stage: see
-    `mean_orbit`. 0 leaves it out. None takes 0, and 0.2 in three dimensions and more
-    ("reproduction" only)."""
+    `mean_orbit`. 0 leaves it out. None takes 0, and 0.2 in three dimensions and more. Needs the
+    objective "reproduction"."""
+    inward_weight: float | None = None
+    """Weight of the penalty on motion away from the recordings, beside the orbit's likelihood: see
+    `inward`. 0 leaves it out. None takes 0, and 1 for motions that repeat in three dimensions and
+    more. Needs an `orbit_weight`."""
     orbit_resolution: float = 0.02
     """Standard deviation to which the orbit is held where all recordings agree."""
     min_decay: float | None = None
@@ -114,8 +134,10 @@ class ImitationFlowConfig:
     """"additive": K dB, the state is bounded around the attractor in distribution. "vanishing":
     noise in proportion to the distance from the attractor, the state comes to rest there."""
     n_jobs: int = 1
-    """Processes of one thread that models trained together, of as many recordings and dimensions,
-    are dealt out to. What trains beside a model changes its rounding, see `ImitationFlow`."""
+    """Processes of one thread that models trained together are dealt out to: those of as many
+    recordings and dimensions, as a batch has to be. Motions of which no two are alike train one
+    after the other all the same. What trains beside a model changes its rounding, see
+    `ImitationFlow`."""
     device: str = "auto"
     """Where training runs: "auto" takes a GPU where torch has one; or a torch device."""
 
@@ -152,6 +174,11 @@ class ImitationFlowConfig:
             raise ValueError(
                 f"Expected error_power in [1, {MOST_ERROR_POWER:g}], got {self.error_power}."
             )
+        if self.objective == "paper" and self.orbit_weight:
+            raise ValueError(
+                f"Expected no orbit_weight with objective='paper', got {self.orbit_weight}: the "
+                "orbit's likelihood is a part of objective='reproduction'."
+            )
         if self.log_scale_bound > MOST_LOG_SCALE:
             raise ValueError(
                 f"Expected log_scale_bound <= {MOST_LOG_SCALE}, got {self.log_scale_bound}: the "
@@ -163,28 +190,24 @@ class ImitationFlowConfig:
             )
         for name in (
             "likelihood_weight", "tube_weight", "calm_weight", "end_weight", "orbit_weight",
-            "timing_weight",
+            "timing_weight", "inward_weight",
         ):  # fmt: skip
             value = getattr(self, name)
-            open_ = name in ("calm_weight", "orbit_weight") and value is None
+            open_ = name in ("calm_weight", "orbit_weight", "inward_weight") and value is None
             if not open_ and not 0 <= value < math.inf:
                 raise ValueError(f"Expected a finite {name} >= 0, got {value}.")
 
     def resolved(self, *, cyclic: bool, n_dims: int) -> Resolved:
-        """Return what `calm_weight`, `orbit_weight` and `min_decay` are for a kind of motion."""
+        """Return what the settings that are None by default are for a kind of motion."""
         in_space = n_dims > 2 and self.objective == "reproduction"
         usual = (IN_SPACE if in_space else IN_PLANE) if cyclic else ENDS
         given = {name: getattr(self, name) for name in Resolved._fields}
-        return usual._replace(**{name: v for name, v in given.items() if v is not None})
-
-    def steps(self, *, cyclic: bool) -> int:
-        """Return the steps of Adam for motions that repeat or end."""
-        if self.n_steps is not None:
-            return self.n_steps
-        return CYCLE_STEPS if cyclic else STEPS
-
-    def slope(self, *, cyclic: bool) -> float:
-        """Return the slope of the units at the start for motions that repeat or end."""
-        if self.sharpness is not None:
-            return self.sharpness
-        return CYCLE_SHARPNESS if cyclic else SHARPNESS
+        found = usual._replace(**{name: v for name, v in given.items() if v is not None})
+        if found.orbit_weight > 0:
+            return found
+        if self.inward_weight:
+            raise ValueError(
+                f"Expected an orbit_weight > 0 with inward_weight={self.inward_weight}, got none: "
+                "the penalty belongs to the stage in which the orbit counts."
+            )
+        return found._replace(inward_weight=0.0)

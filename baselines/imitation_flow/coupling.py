@@ -127,7 +127,7 @@ class _Forward(torch.autograd.Function):
     def forward(ctx: Any, z: Tensor, context: Tensor | None, *args: Any) -> Tensor:
         runs = _runs([z, context], args)
         results = [kernels.forward(xp, x, c, w) for xp, (x, c), w in runs]
-        return _keep(ctx, results, context, args)[0]
+        return _keep(ctx, runs, results, context, args)[0]
 
     @staticmethod
     @once_differentiable
@@ -142,7 +142,7 @@ class _Inverse(torch.autograd.Function):
     def forward(ctx: Any, y: Tensor, context: Tensor | None, *args: Any) -> tuple[Tensor, ...]:
         runs = _runs([y, context], args)
         results = [kernels.inverse(xp, x, c, w) for xp, (x, c), w in runs]
-        return _keep(ctx, results, context, args)
+        return _keep(ctx, runs, results, context, args)
 
     @staticmethod
     @once_differentiable
@@ -171,27 +171,30 @@ def _runs(
 
 
 def _keep(
-    ctx: Any, results: Sequence[tuple[Any, ...]], context: Tensor | None, args: Sequence[Any]
+    ctx: Any,
+    runs: Sequence[tuple[Any, Any, kernels.Weights]],
+    results: Sequence[tuple[Any, ...]],
+    context: Tensor | None,
+    args: Sequence[Any],
 ) -> tuple[Tensor, ...]:
-    """Keep the traces for the gradient; return the results as tensors (m, ...)."""
-    *weights, ctx.n_kept, ctx.bound = args
-    ctx.save_for_backward(*weights)
-    ctx.traces, ctx.has_context = [r[-1] for r in results], context is not None
+    """Keep weights and traces for the gradient; return the results as tensors (m, ...)."""
+    ctx.weights, ctx.traces = [w for *_, w in runs], [r[-1] for r in results]
+    ctx.has_context = context is not None
     return tuple(_stacked([r[i] for r in results]) for i in range(len(results[0]) - 1))
 
 
 def _gradients(ctx: Any, gradient: Callable[..., Any], g: Sequence[Tensor]) -> tuple[Any, ...]:
-    runs = _runs(g, (*ctx.saved_tensors, ctx.n_kept, ctx.bound))
+    if isinstance(ctx.weights[0].rotation, Tensor):
+        states, context, weights = gradient(torch, *g, ctx.traces[0], ctx.weights[0])
+        return states, context if ctx.has_context else None, *weights, None, None
+    arrays = [x.detach().contiguous().numpy() for x in g]
     results = [
-        gradient(xp, *arrays, trace, w)
-        for (xp, arrays, w), trace in zip(runs, ctx.traces, strict=True)
+        gradient(np, *(x[m] for x in arrays), trace, w)
+        for m, (trace, w) in enumerate(zip(ctx.traces, ctx.weights, strict=True))
     ]
     states = _stacked([r[0] for r in results])
     context = _stacked([r[1] for r in results]) if ctx.has_context else None
-    if isinstance(results[0][0], Tensor):
-        weights = results[0][2]
-    else:
-        weights = [_stacked([r[2][i] for r in results]).movedim(0, 1) for i in range(3)]
+    weights = [_stacked([r[2][i] for r in results]).movedim(0, 1) for i in range(3)]
     return states, context, *weights, None, None
 
 
@@ -199,4 +202,4 @@ def _stacked(arrays: Sequence[Any]) -> Tensor:
     """Join the models' arrays, or take the batch's as it is."""
     if isinstance(arrays[0], Tensor):
         return arrays[0]
-    return torch.from_numpy(np.stack(arrays))
+    return torch.from_numpy(arrays[0][None] if len(arrays) == 1 else np.stack(arrays))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -246,9 +247,9 @@ class Draws:
 
     def uniform(self, *shape: int) -> Tensor:
         """Numbers in [0, 1) of shape (m, *shape), not used before."""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         taken = self._numbers[self._step][:, self._used : self._used + size]
         if taken.shape[1] < size:
             raise RuntimeError(f"Expected at most {self._per_step} numbers a step.")
         self._used += size
-        return taken.unflatten(1, shape)
+        return taken.view(-1, *shape)

@@ -37,7 +37,7 @@ def make_flow(
     sizes = (n_dims, config.n_layers, config.n_hidden, n_context)
     shape: dict[str, Any] = {
         "log_scale_bound": config.log_scale_bound,
-        "sharpness": config.slope(cyclic=cyclic),
+        "sharpness": config.resolved(cyclic=cyclic, n_dims=n_dims).sharpness,
         "generators": generators,
     }
     if config.emission == "spline":

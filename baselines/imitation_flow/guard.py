@@ -13,11 +13,13 @@ views: what is done to each is then done in one operation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 WINDOW = 25
 """Steps between two looks."""
@@ -31,7 +33,11 @@ MOST_RESTARTS = 5
 WARM_UP = 0.15
 """Share of the steps in which the learning rate rises."""
 
-MOMENTS = ("exp_avg", "exp_avg_sq")
+BETAS = (0.9, 0.99)
+"""Adam's decays; the first is cycled."""
+
+EPSILON = 1e-8
+"""Adam's."""
 
 
 class TrainingError(RuntimeError):
@@ -61,6 +67,24 @@ def restarts_of(header: Mapping[str, Any]) -> list[Restart]:
     return found
 
 
+def one_cycle(peak: float, n_steps: int) -> list[tuple[float, float]]:
+    """Return the rate and Adam's first decay at each step: torch's one-cycle schedule, made once.
+
+    The decay goes down while the rate goes up.
+    """
+    optimizer = torch.optim.Adam([nn.Parameter(torch.zeros(1))], lr=peak, betas=BETAS)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, peak, total_steps=n_steps + 1, pct_start=WARM_UP
+    )
+    (group,) = optimizer.param_groups
+    found = []
+    for _ in range(n_steps):
+        found.append((group["lr"], group["betas"][0]))
+        optimizer.step()
+        schedule.step()
+    return found
+
+
 class GuardedAdam:
     """Adam with a one-cycle rate for m models at once, and an eye on each.
 
@@ -81,6 +105,8 @@ class GuardedAdam:
     restarts : list of m lists of Restart
     failures : dict of int to TrainingError
         Models that do not train on, and why.
+    failed : Tensor of bool, shape (m,)
+        Which these are.
     """
 
     def __init__(
@@ -96,46 +122,50 @@ class GuardedAdam:
         self._parameters, self._axes = zip(*parameters, strict=True)
         self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
         self._make_views()
-        self._optimizer = torch.optim.Adam(
-            [self._flat], lr=learning_rate, betas=(0.9, 0.99), fused=True
-        )
-        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self._optimizer, learning_rate, total_steps=n_steps + 1, pct_start=WARM_UP
-        )
+        self._moments = [torch.zeros_like(self._flat.data) for _ in range(2)]
+        self._n_taken = torch.zeros((), dtype=torch.float32, device=self._flat.device)
+        self._cycle, self._taken = one_cycle(learning_rate, n_steps), 0
         like = self._flat.detach()[:, 0]
         self._rate, self._sum = torch.ones_like(like), torch.zeros_like(like)
         self._best, self._kept = torch.full_like(like, torch.inf), torch.full_like(like, torch.inf)
         self._first = self._last = torch.zeros_like(like)
         self._count, self._stage, self._slowed = 0, 0, False
+        self._begins = True
         self._good = [t.clone() for t in self._state()]
         self.restarts: list[list[Restart]] = [[] for _ in self._names]
         self.failures: dict[int, TrainingError] = {}
-        self._failed = torch.zeros_like(like, dtype=torch.bool)
+        self.failed = torch.zeros_like(like, dtype=torch.bool)
 
-    def step(self, step: int, stage: int, loss: Tensor) -> None:
-        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind."""
+    def step(self, step: int, stage: int, loss: Tensor, judged: Tensor | None = None) -> None:
+        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind.
+
+        Where the loss has weights that change within a stage, what is judged is one without.
+        """
+        judged = loss.detach() if judged is None else judged.detach()
         if stage != self._stage:
             self.look(step)
-            self._stage = stage
+            self._stage, self._begins = stage, True
             self._best.fill_(torch.inf)
-        if bool(self._best.isinf().all()):  # a stage begins: what it has to be better than
-            self._first = loss.detach().clone()
+        if self._begins:  # a stage begins: what it has to be better than
+            self._first = judged.clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
+            self._begins = bool(self._best.isinf().all())
         gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
-        self._flat.grad = gradient = self._joined(
+        gradient = self._joined(
             [torch.zeros_like(p) if g is None else g
              for g, p in zip(gradients, self._parameters, strict=True)]
         )  # fmt: skip
-        norm = gradient.norm(dim=1)
-        finite = norm.isfinite() & ~self._failed if self.failures else norm.isfinite()
-        gradient.masked_fill_(~finite[:, None], 0.0)
-        gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm)).nan_to_num_(0.0)[:, None])
-        self._last = torch.where(finite, loss.detach(), torch.inf)
+        norm, self._last = gradient.norm(dim=1), judged
+        if self.failures or not math.isfinite(norm.sum()):
+            trains = norm.isfinite() & ~self.failed
+            gradient.masked_fill_(~trains[:, None], 0.0)
+            norm = norm.nan_to_num(0.0, 0.0)
+            self._last = torch.where(trains, self._last, torch.inf)
+        gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm))[:, None])
         self._sum += self._last
         self._count += 1
         before = self._flat.detach().clone() if self._slowed else None
-        self._optimizer.step()
-        self._schedule.step()
+        self._adam(gradient)
         if before is not None:
             self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
         if self._count == WINDOW:
@@ -145,7 +175,7 @@ class GuardedAdam:
         """Look once more; a stage that ends worse than it began is a failure."""
         self.look(step)
         worse = self._kept > self._first + self._first.abs().clamp_min(1.0)
-        for i in (worse & ~self._failed).nonzero()[:, 0].tolist():
+        for i in (worse & ~self.failed).nonzero()[:, 0].tolist():
             self._fail(
                 i,
                 f"its loss ended at {self._kept[i]:.3g} and was {self._first[i]:.3g} at the "
@@ -160,9 +190,10 @@ class GuardedAdam:
         allowed = self._best + TOLERANCE * self._best.abs().clamp_min(1.0)
         bad = ~loss.isfinite() | (loss > allowed) | (self._last > allowed)
         bad |= ~self._flat.detach().isfinite().all(1)
-        bad &= ~self._failed
+        bad &= ~self.failed
         self._best = torch.where(bad, self._best, torch.minimum(self._best, loss))
         self._kept = torch.where(bad, self._kept, loss)
+        self._begins = self._begins and bool(self._best.isinf().all())
         self._sum.zero_()
         self._count = 0
         if bool(bad.any()):
@@ -185,16 +216,26 @@ class GuardedAdam:
 
     def _fail(self, model: int, why: str) -> None:
         """Leave a model as it is from now on."""
-        self._failed[model], self._rate[model] = True, 0.0
+        self.failed[model], self._rate[model] = True, 0.0
         self.failures[model] = TrainingError(
             f"ImitationFlow did not converge on {self._names[model]!r}: {why}. Lower learning_rate "
             "or the weights."
         )
 
+    def _adam(self, gradient: Tensor) -> None:
+        """Take Adam's step: torch's function, without what its optimizer does around it."""
+        rate, decay = self._cycle[self._taken]
+        self._taken += 1
+        mean, square = self._moments
+        adam(
+            [self._flat.data], [gradient], [mean], [square], [], [self._n_taken],
+            fused=True, amsgrad=False, maximize=False,
+            beta1=decay, beta2=BETAS[1], lr=rate, weight_decay=0.0, eps=EPSILON,
+        )  # fmt: skip
+
     def _state(self) -> list[Tensor]:
-        """Return the parameters and Adam's moments, zero before the first step."""
-        state, data = self._optimizer.state[self._flat], self._flat.data
-        return [data, *(state.get(name, torch.zeros_like(data)) for name in MOMENTS)]
+        """Return the parameters and Adam's moments."""
+        return [self._flat.data, *self._moments]
 
     def _joined(self, tensors: Sequence[Tensor]) -> Tensor:
         """Join tensors of the parameters' shapes to (m, p)."""

@@ -72,7 +72,7 @@ def forward_gradient(
     xp: Any, g: Array, trace: Trace, w: Weights
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of z, of the context and of R, W1, W2, from that of y."""
-    k, work = w.n_kept, _Work(xp, g, w)
+    k, work = w.n_kept, _Work(xp, g, trace, w)
     for layer in reversed(range(len(w.rotation))):
         u, g_b, g_u = trace.turned[layer], work.g[..., k:, :], work.g_u
         g_moved = g_u[..., k:, :]
@@ -106,7 +106,7 @@ def inverse_gradient(
     xp: Any, g: Array, g_log_det: Array, trace: Trace, w: Weights
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of y, of the context and of R, W1, W2, from those of z and log |det|."""
-    k, work = w.n_kept, _Work(xp, g, w)
+    k, work = w.n_kept, _Work(xp, g, trace, w)
     for layer in range(len(w.rotation)):
         u, g_u = trace.turned[layer], work.g_u
         xp.matmul(u, work.g.swapaxes(-1, -2), out=work.g_rotation[layer])
@@ -124,9 +124,9 @@ def inverse_gradient(
 
 
 class _Work:
-    """Arrays that a gradient works in."""
+    """Arrays that a gradient works in; what all layers need is computed for all at once."""
 
-    def __init__(self, xp: Any, g: Array, w: Weights) -> None:
+    def __init__(self, xp: Any, g: Array, trace: Trace, w: Weights) -> None:
         self.xp = xp
         h, seen = w.hidden.shape[-2:]
         lead, d = g.shape[:-2], g.shape[-2]
@@ -136,32 +136,25 @@ class _Work:
         self.g_u = _empty(xp, g, (*lead, d))
         self.g_both = _empty(xp, g, (*lead, 2 * n_moved))
         self.g_s, self.g_shift = self.g_both[..., :n_moved, :], self.g_both[..., n_moved:, :]
-        self.g_units, self.slope = _empty(xp, g, (*lead, h)), _empty(xp, g, (*lead, h))
-        self.narrow = _empty(xp, g, (*lead, n_moved))
-        self.g_seen = _empty(xp, g, (*lead, seen))
+        self.g_units, self.g_seen = _empty(xp, g, (*lead, h)), _empty(xp, g, (*lead, seen))
         self.g_context = _empty(xp, g, (*lead, seen - 1 - w.n_kept))
         self.g_context[...] = 0
         self.g_rotation, self.g_hidden, self.g_out = (
             xp.empty_like(x) for x in (w.rotation, w.hidden, w.out)
         )
+        # 1 - tanh^2 of the units and, with the bound, of the log-scales.
+        self.slopes = 1 - trace.units * trace.units
+        self.narrows = w.bound * (1 - trace.squashed * trace.squashed)
 
     def conditioner(self, trace: Trace, w: Weights, layer: int) -> Array:
         """Take the weights' gradients from those of s and t; return that of what was seen."""
-        xp, units = self.xp, trace.units[layer]
-        squashed = trace.squashed[layer]
-        xp.multiply(squashed, squashed, out=self.narrow)
-        self.narrow -= 1.0
-        self.narrow *= -w.bound
-        self.g_s *= self.narrow
-        xp.matmul(self.g_both, units.swapaxes(-1, -2), out=self.g_out[layer])
+        xp = self.xp
+        self.g_s *= self.narrows[layer]
+        xp.matmul(self.g_both, trace.units[layer].swapaxes(-1, -2), out=self.g_out[layer])
         xp.matmul(w.out[layer].swapaxes(-1, -2), self.g_both, out=self.g_units)
-        xp.multiply(units, units, out=self.slope)
-        self.slope -= 1.0
-        self.g_units *= self.slope  # its sign is turned below
+        self.g_units *= self.slopes[layer]
         xp.matmul(self.g_units, trace.seen[layer].swapaxes(-1, -2), out=self.g_hidden[layer])
-        self.g_hidden[layer] *= -1.0
         xp.matmul(w.hidden[layer].swapaxes(-1, -2), self.g_units, out=self.g_seen)
-        self.g_seen *= -1.0
         if self.g_context.shape[-2]:
             self.g_context += self.g_seen[..., w.n_kept : -1, :]
         return self.g_seen

@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from iflow_gym.baselines.imitation_flow.planar import Propagate, TransitionLogProb
+
 MIN_NOISE = 1e-4
 """Least diffusion per square root of the duration: keeps covariances invertible."""
 
@@ -33,9 +35,6 @@ INITIAL_DECAY = 3.0
 """The latent state falls to exp(-3) = 5 % within a demonstration's duration at the start."""
 
 INITIAL_NOISE = 0.3
-
-SMALL_ROOT = 0.03
-"""Below it sinh(q) / q is taken from its series, whose next term is 1e-12."""
 
 
 class Latent(nn.Module, ABC):
@@ -93,9 +92,8 @@ class LinearLatent(Latent):
 
     def drift(self) -> Tensor:
         """Return A, shape (m, d, d)."""
-        lower = torch.tril(self.factor)
-        eye = torch.eye(lower.shape[-1], dtype=lower.dtype, device=lower.device)
-        return self.skew - self.skew.mT - lower @ lower.mT - self.min_decay * eye
+        drift: Tensor = _Drift.apply(self.factor, self.skew, self.min_decay)
+        return drift
 
     def diffusion(self) -> Tensor:
         """Return K K^T, shape (m, d, d)."""
@@ -105,20 +103,19 @@ class LinearLatent(Latent):
         """Return exp(A t) z. In the plane no matrix is built for a point."""
         drift = self.drift()
         if z.shape[1] == 2:
-            even, odd, centred = _exponential_2d(drift, times)
-            shape = (len(z), 1, *times.shape[1:], *[1] * (z.dim() - times.dim() - 1))
-            turned = torch.bmm(centred, z.flatten(2)).view(z.shape)
-            return torch.addcmul(even.view(shape) * z, odd.view(shape), turned)
+            return Propagate.apply(drift, _by_horizon(z, times), times).view(z.shape)
         return _apply(propagator(drift, times), z)
 
     def transition_log_prob(self, z0: Tensor, z1: Tensor, times: Tensor) -> Tensor:
         """Return log N(z1 | F z0, P - F P F^T), (m, n) or (m, q, p)."""
-        residual = z1 - self.propagate(z0, times)
-        drift, noise = self.drift().double(), self.diffusion().double()
-        times = times.double()
+        drift, noise = self.drift(), self.diffusion()
         if z0.shape[1] == 2:
-            return _white_2d(residual, *_covariance_2d(drift, noise, times))
-        return _white(residual, transition(drift, noise, times)[1])
+            before, after = _by_horizon(z0, times), _by_horizon(z1, times)
+            found = TransitionLogProb.apply(drift, noise, before, after, times)
+            return found.view(z0[:, 0].shape)
+        residual = z1 - _apply(propagator(drift, times), z0)
+        precise = drift.double(), noise.double(), times.double()
+        return _white(residual, transition(*precise)[1])
 
     def backward_log_prob(self, z0: Tensor, z1: Tensor, times: Tensor) -> Tensor:
         """Return log N(z0 | F^-1 z1, F^-1 Sigma F^-T) = log N(z1 | F z0, Sigma) + log |det F|."""
@@ -138,70 +135,40 @@ class LinearLatent(Latent):
             return {name: value.double().cpu().numpy() for name, value in pair.items()}
 
 
+class _Drift(torch.autograd.Function):
+    """A = -(L L^T + eps I) + S - S^T, as one node."""
+
+    @staticmethod
+    def forward(ctx: Any, factor: Tensor, skew: Tensor, min_decay: float) -> Tensor:
+        lower = torch.tril(factor)
+        ctx.save_for_backward(lower)
+        drift = skew - skew.mT - torch.bmm(lower, lower.mT)
+        drift.diagonal(dim1=-2, dim2=-1).sub_(min_decay)
+        return drift
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
+        (lower,) = ctx.saved_tensors
+        return -torch.tril(torch.bmm(g + g.mT, lower)), g - g.mT, None
+
+
 def propagator(drift: Tensor, times: Tensor) -> Tensor:
     """exp(A t) for A (m, d, d) and times (m, ...): shape (m, ..., d, d)."""
-    flat = times.flatten(1)
-    if drift.shape[-1] == 2:
-        even, odd, centred = _exponential_2d(drift, flat)
-        eye = torch.eye(2, dtype=drift.dtype, device=drift.device)
-        result = even[..., None, None] * eye + odd[..., None, None] * centred[:, None]
+    flat, d = times.flatten(1), drift.shape[-1]
+    if d == 2:
+        eye = torch.eye(d, dtype=drift.dtype, device=drift.device)
+        columns = eye[:, None].expand(*flat.shape[:1], d, flat.shape[1], d)
+        result = Propagate.apply(drift, columns, flat).transpose(1, 2)
     else:
         result = torch.linalg.matrix_exp(drift[:, None] * flat[..., None, None])
     return result.unflatten(1, times.shape[1:])
 
 
-def _exponential_2d(drift: Tensor, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return e, o of times' shape and C (m, 2, 2) with exp(A t) = e I + o C, C = A - (tr A / 2) I.
-
-    e = exp(k t) cosh(q t), o = exp(k t) sinh(q t) / q, k = tr A / 2, q^2 = -det C. With q^2 < 0
-    these are cosine and sine.
-    """
-    shape = (-1, *[1] * (times.dim() - 1))
-    first, cross, back, last = drift.flatten(1).unbind(1)
-    half = (first - last) / 2
-    centred = torch.stack([half, cross, back, -half], dim=-1).unflatten(-1, (2, 2))
-    rate = ((first + last) / 2).view(shape) * times
-    square = (half * half + cross * back).view(shape) * times**2
-    even, odd = _CoshSinh.apply(rate, square)
-    return even, odd * times, centred
-
-
-class _CoshSinh(torch.autograd.Function):
-    """exp(r) cosh(sqrt s) and exp(r) sinh(sqrt s) / sqrt s, for s of either sign, as one node.
-
-    Their derivatives by s are o / 2 and (e - o) / (2 s), which autograd would find as sums over the
-    branches, in many times as many operations.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, rate: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
-        root = square.abs().sqrt()
-        positive, small = square > 0, root < SMALL_ROOT
-        safe = torch.where(small, 1.0, root)
-        # The exponents r + q and r - q are those of A's eigenvalues: nothing overflows.
-        decay = torch.exp(rate + torch.where(positive, root, 0.0))
-        less = torch.expm1(-2 * root)
-        even = decay * torch.where(positive, 1 + less / 2, torch.cos(root))
-        odd = decay * torch.where(positive, -less / 2, torch.sin(root)) / safe
-        odd = torch.where(small, torch.exp(rate) * (1 + square / 6 + square**2 / 120), odd)
-        ctx.save_for_backward(even, odd, square, rate, small)
-        return even, odd
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g_even: Tensor, g_odd: Tensor) -> tuple[Tensor, Tensor]:
-        even, odd, square, rate, small = ctx.saved_tensors
-        by_series = torch.exp(rate) * (1 / 6 + square / 60)
-        slope = torch.where(small, by_series, (even - odd) / (2 * torch.where(small, 1.0, square)))
-        return g_even * even + g_odd * odd, g_even * odd / 2 + g_odd * slope
-
-
 def stationary_covariance(drift: Tensor, diffusion: Tensor) -> Tensor:
     """P with A P + P A^T + K K^T = 0, all (m, d, d), by the vectorised linear system.
 
-    In the plane by its solution, a sum of two positive terms (Gardiner, "Handbook of Stochastic
-    Methods", on the multivariate Ornstein-Uhlenbeck process),
-    P = (det(A) K K^T + B K K^T B^T) / (-2 tr(A) det(A)) with B = A - tr(A) I.
+    In the plane by its solution, a sum of two positive terms (see `planar`).
     """
     d = drift.shape[-1]
     eye = torch.eye(d, dtype=drift.dtype, device=drift.device)
@@ -233,39 +200,9 @@ def transition(drift: Tensor, diffusion: Tensor, times: Tensor) -> tuple[Tensor,
     return forward, (covariance + covariance.mT) / 2 + floor
 
 
-def _covariance_2d(
-    drift: Tensor, diffusion: Tensor, times: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the entries (0, 0), (0, 1), (1, 1) of z_t's covariance, each of times' shape.
-
-    With F = e I + o C, F P F^T = e^2 P + e o (C P + P C^T) + o^2 C P C^T.
-    """
-    even, odd, centred = _exponential_2d(drift, times)
-    stationary = stationary_covariance(drift, diffusion)
-    mixed = centred @ stationary
-    parts = torch.stack([stationary, -(mixed + mixed.mT), -mixed @ centred.mT], dim=-1)
-    powers = torch.stack([1 - even**2, even * odd, odd**2], dim=1)
-    a, b, _, c = torch.bmm(parts.flatten(1, 2), powers).unbind(1)
-    floor = _floor(stationary)
-    return a + floor, b, c + floor
-
-
-def _white_2d(residual: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Log density of N(0, [[a, b], [b, c]]), entries (m, n), at (m, 2, n) or (m, 2, n, p).
-
-    By the Cholesky factor: the squares cannot become negative by rounding.
-    """
-    first = torch.sqrt(a)
-    slope = b / a
-    second = torch.sqrt(c - b * slope)
-    log_det = torch.log(first * second)
-    x, y = residual[:, 0], residual[:, 1]
-    shape = (*a.shape, *[1] * (x.dim() - a.dim()))
-    first, slope, second, log_det = (
-        v.to(residual.dtype).view(shape) for v in (1 / first, slope, 1 / second, log_det)
-    )
-    square = (x * first).square() + ((y - slope * x) * second).square()
-    return -0.5 * square - log_det - math.log(2 * math.pi)
+def _by_horizon(z: Tensor, times: Tensor) -> Tensor:
+    """Return states as (m, d, q, p) for times (m, q)."""
+    return z if z.dim() > times.dim() + 1 else z[..., None]
 
 
 def _apply(matrices: Tensor, z: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from iflow_gym.baselines.imitation_flow.calm import Calmness, calmness_of
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Frame, Task
 from iflow_gym.baselines.imitation_flow.emissions import FIELDS, make_field
@@ -87,8 +88,13 @@ class ImitationFlow(DynamicalSystem):
     Attributes
     ----------
     restarts_ : list of Restart
-        Where training diverged: the step, and the share of the learning rate it went on with. A
-        file keeps them.
+        Where training diverged: the step, and the share of the learning rate it went on with.
+    calm_ : Calmness or None
+        The fastest speed that was found in twice the recordings' box, in their peak speed, and the
+        rounds of training that were added because of it. None where it was not looked at: motions
+        that repeat, ``objective="paper"``, ``calm_weight=0``.
+
+    A file keeps both.
 
     Examples
     --------
@@ -162,6 +168,7 @@ class ImitationFlow(DynamicalSystem):
             "time": np.array([frame.time]),
         }
         self.restarts_: list[Restart] = trained.restarts
+        self.calm_: Calmness | None = trained.calm
         if self.config.noise == "vanishing":
             arrays["kappa"] = np.ones(1)
         self._adopt(arrays, task.origins[0], cyclic=task.cyclic)
@@ -343,11 +350,14 @@ class ImitationFlow(DynamicalSystem):
         )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write a model file, see `Method.save`; restarts of its training stand in the header."""
+        """Write a model file, see `Method.save`; the header says what became of its training."""
         target = super().save(path)
-        if self.restarts_:
+        said: dict[str, Any] = {"restarts": self.restarts_} if self.restarts_ else {}
+        if self.calm_ is not None:
+            said["calm"] = self.calm_
+        if said:
             header, arrays = read_model_file(target)
-            write_model_file(target, {**header, "restarts": self.restarts_}, arrays)
+            write_model_file(target, {**header, **said}, arrays)
         return target
 
     @classmethod
@@ -357,13 +367,14 @@ class ImitationFlow(DynamicalSystem):
         header, _ = read_model_file(path)
         with model_file_errors(path, cls.name):
             system.restarts_ = restarts_of(header)
+            system.calm_ = calmness_of(header)
         return system
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return dict(self._parameters)
 
     def _restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        self.restarts_ = []
+        self.restarts_, self.calm_ = [], None
         self._adopt(arrays, self.goal_, cyclic=self.period_ is not None)
 
     def _adopt(

@@ -1,7 +1,7 @@
 """The terms of ImitationFlow's objectives, each a generator for `passes.evaluate`.
 
-Forward likelihood, reproduction, tube and calm are the default's; backward likelihood and end are
-Algorithm 1's (paper, eqs. 6 and 7).
+Forward likelihood, reproduction and tube are the default's, and the calm, which is in `calm`;
+backward likelihood and end are Algorithm 1's (paper, eqs. 6 and 7).
 """
 
 from __future__ import annotations
@@ -16,12 +16,10 @@ from torch import Tensor
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings
 from iflow_gym.baselines.imitation_flow.latent import Latent
 from iflow_gym.baselines.imitation_flow.passes import Points, Starts, Term
+from iflow_gym.baselines.imitation_flow.path_error import PathError
 
 LONGEST_HORIZON = 0.6
 """Longest horizon of the likelihood, as a fraction of the recording."""
-
-CALM_STEP = 0.005
-"""The calm term sees the mean speed over this fraction of the duration."""
 
 
 def everyone(data: Recordings) -> Tensor:
@@ -127,13 +125,9 @@ def reproduction(
     samples = _samples(data, draws, n_times)
     ends = (data.lengths - 1)[..., None]
     made, target, along = yield from _reproduced(data, starts, torch.cat([samples, ends], dim=-1))
-    error = made - target
-    squares = error.square().sum(1)
-    late = (error * along).sum(1).square() / along.square().sum(1).clamp_min(1e-12)
-    squares, late = (x.unflatten(1, (data.n_recordings, -1)) for x in (squares, late))
-    weighted = (squares - (1 - timing_weight) * late)[..., :-1].clamp_min(0.0)
-    errors = (weighted.pow(power).mean(-1) + 1e-16).pow(1 / power)
-    return errors.mean(1) + end_weight * squares[..., -1].mean(1)
+    settings = power, timing_weight, end_weight
+    error: Tensor = PathError.apply(made, target, along, data.n_recordings, *settings)
+    return error
 
 
 def tube(data: Recordings, draws: Draws, n_times: int, *, width: float) -> Term:
@@ -175,36 +169,3 @@ def _reproduced(
     z, _ = yield Points(starts, everybody)
     made = yield Starts(z.repeat_interleave(n_times, dim=-1), times, among)
     return made, target, target - data.at(among, samples - 1)
-
-
-class Calm:
-    """Squared log of speed over `limit` times the recordings' peak, in twice their box.
-
-    Fast places are small: half of the states of a call are new, the others are the fastest of the
-    call before, so that a fast place is looked at until it is calm.
-    """
-
-    def __init__(self, data: Recordings, n_points: int, limit: float) -> None:
-        self._data, self._n_new, self._limit = data, n_points // 2, limit
-        self._kept: Points | None = None
-
-    def __call__(self, draws: Draws) -> Term:
-        """Return the term of one step."""
-        data = self._data
-        uniform = draws.uniform(data.n_dims, self._n_new)
-        among = (draws.uniform(self._n_new) * data.n_recordings).long()
-        points = Points(data.centre + 2 * data.half * (2 * uniform - 1), among)
-        if self._kept is not None:
-            points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
-        z, _ = yield points
-        y, among = points
-        moved = yield Starts(z, z.new_full(among.shape, CALM_STEP), among)
-        unit = CALM_STEP * self._limit * data.peak_speed
-        speed = (torch.bmm(data.frame, moved - y) / unit[..., None]).square().sum(1)
-        excess = torch.log(speed.add(1e-12)) / 2
-        fastest = excess.detach().topk(self._n_new, dim=1).indices
-        self._kept = Points(
-            torch.gather(y, 2, fastest[:, None].expand(-1, data.n_dims, -1)),
-            torch.gather(among, 1, fastest),
-        )
-        return torch.relu(excess).square().mean(1)

@@ -35,18 +35,19 @@ import numpy as np
 import torch
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
+from iflow_gym.baselines.imitation_flow.calm import Calm, Calmness, Sampling
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.guard import GuardedAdam, Restart, TrainingError
+from iflow_gym.baselines.imitation_flow.inward import N_STATES, Inward
 from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
 from iflow_gym.baselines.imitation_flow.mean_orbit import MeanOrbit
 from iflow_gym.baselines.imitation_flow.objectives import (
-    Calm,
     backward_likelihood,
     forward_likelihood,
     pairs_of,
@@ -63,12 +64,22 @@ SQUARED_ERROR_WEIGHT = 300.0
 N_HORIZONS = 14
 """Sampling times in a step's likelihood."""
 
-TURNS = 2
+TURNS = 4
 """The likelihood and the tube take their turns beside the reproduction, one each in so many steps,
 with so many times the weight: that trains as well, in less time."""
 
-N_CALM = 32
-"""States in a step's calm penalty."""
+CALM_ENDS, CALM_CYCLES = Sampling(n_points=64, step=0.001), Sampling(n_points=32, step=0.005)
+"""What the calm penalty looks at, where motions end and where they repeat."""
+
+N_WATCHES = 40
+"""Sweeps for fast places in the training of motions that end."""
+
+CALM_ROUNDS, CALM_SHARE, CALM_RATE = 6, 0.05, 0.3
+"""A model that is loud at the end is trained on, alone, in so many rounds at most, each of a share
+of the steps and with a share of the rate."""
+
+N_SWEEPS = 16
+"""Lattices that say whether a model is loud at the end."""
 
 ORBIT_FRACTION = 0.3
 """Share of a cycle's steps that maximise the likelihood alone before its orbit counts."""
@@ -91,6 +102,8 @@ class Trained:
     place: int
     restarts: list[Restart]
     """How often training diverged and was taken back."""
+    calm: Calmness | None = None
+    """How calm it is, where that was looked at."""
 
     def arrays(self, context: Tensor | None = None) -> dict[str, NDArray[np.float64]]:
         """Return the numbers of the flow, a context (k,) folded in, and of the latent system."""
@@ -142,7 +155,8 @@ def _one_thread() -> Iterator[None]:
 def _train(
     config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
 ) -> list[Trained | TrainingError]:
-    with _one_thread():
+    # What overflows is noticed by its loss.
+    with _one_thread(), np.errstate(all="ignore"):
         return _train_batch(config, tasks, rngs)
 
 
@@ -154,45 +168,150 @@ def _train_batch(
         if config.device == "auto"
         else config.device
     )
-    data = Recordings(tasks, device)
     generators = [torch.Generator().manual_seed(int(rng.integers(2**63))) for rng in rngs]
-    sizes = (data.n_dims, tasks[0].n_context)
-    flow = make_flow(config, *sizes, generators, cyclic=data.cyclic).to(device)
-    latent = _make_latent(config, tasks).to(device)
-    draws = Draws(rngs, _numbers_a_step(config, data), device)
-    n_steps = config.steps(cyclic=data.cyclic)
-    adam = GuardedAdam(
-        [*((p, 1) for p in flow.parameters()), *((p, 0) for p in latent.parameters())],
-        [task.name for task in tasks],
-        n_steps=n_steps,
-        learning_rate=config.learning_rate,
-        max_norm=config.max_gradient_norm,
-    )
-    calm = Calm(data, N_CALM, config.calm_speed)
-    orbit_weight = _resolved(config, data).orbit_weight
-    held = data.cyclic and orbit_weight > 0
-    orbit = MeanOrbit(tasks, data, config.orbit_resolution) if held else None
+    batch = _Batch(config, tasks, rngs, generators, device)
+    n_steps, calm = batch.resolved.n_steps, batch.watched
+    adam = batch.optimizer(n_steps, config.learning_rate)
+    every = max(1, n_steps // N_WATCHES)
     for step in range(n_steps):
-        draws.new_step()
-        stage = _stage(config, step, data)
-        weighted = _terms(config, step, latent, data, draws, calm)
-        if orbit is not None and stage == ORBIT:
-            assert isinstance(latent, LimitCycleLatent)
-            weighted.append((orbit_weight, orbit(latent)))
-        weights, terms = zip(*weighted, strict=True)
-        losses = evaluate(flow, latent, data, terms)
-        loss = torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum(0)
-        adam.step(step, stage, loss)
+        if calm is not None and step and step % every == 0:
+            calm.watch(batch.flow, batch.latent)
+        batch.step(adam, step, _stage(config, step, batch.data))
         if len(adam.failures) == len(tasks):
             return [adam.failures[m] for m in range(len(tasks))]
     adam.finish(n_steps)
-    if _stage(config, n_steps, data) == WHOLE:
-        _fit_noise(flow, latent, data, rngs)
-    flow, latent = flow.to("cpu"), latent.to("cpu")
+    calmness: list[Calmness | None] = [None] * len(tasks)
+    if calm is not None:
+        speeds = calm.watch(batch.flow, batch.latent, N_SWEEPS)
+        for m, speed in enumerate(speeds.tolist()):
+            calmness[m] = Calmness(speed, 0)
+            if bool(calm.loud(speeds)[m]) and m not in adam.failures:
+                alone = _Batch(config, [tasks[m]], [rngs[m]], [generators[m]], device)
+                alone.take(batch, m)
+                slowed = adam.restarts[m][-1].rate if adam.restarts[m] else 1.0
+                calmness[m], restarts = _calm_down(config, alone, n_steps, CALM_RATE * slowed)
+                adam.restarts[m] += restarts
+                alone.give(batch, m)
+    if _stage(config, n_steps, batch.data) == WHOLE:
+        _fit_noise(batch.flow, batch.latent, batch.data, rngs)
+    flow, latent = batch.flow.to("cpu"), batch.latent.to("cpu")
     return [
-        adam.failures.get(m) or Trained(flow, latent, m, adam.restarts[m])
+        adam.failures.get(m) or Trained(flow, latent, m, adam.restarts[m], calmness[m])
         for m in range(len(tasks))
     ]
+
+
+class _Batch:
+    """Models that train together, and what a step of theirs needs."""
+
+    def __init__(
+        self,
+        config: ImitationFlowConfig,
+        tasks: Sequence[Task],
+        rngs: Sequence[np.random.Generator],
+        generators: list[torch.Generator],
+        device: torch.device,
+    ) -> None:
+        self._config, self._names = config, [task.name for task in tasks]
+        self.data = data = Recordings(tasks, device)
+        self.resolved = resolved = _resolved(config, data)
+        sizes = (data.n_dims, tasks[0].n_context)
+        self.flow = make_flow(config, *sizes, generators, cyclic=data.cyclic).to(device)
+        self.latent = _make_latent(config, tasks).to(device)
+        self._draws = Draws(rngs, _numbers_a_step(config, data), device)
+        self._calm: Calm | None = None
+        if resolved.calm_weight and config.objective == "reproduction":
+            sampling = CALM_CYCLES if data.cyclic else CALM_ENDS
+            self._calm = Calm(data, sampling, config.calm_speed)
+        self._orbit: MeanOrbit | None = None
+        if data.cyclic and resolved.orbit_weight > 0:
+            self._orbit = MeanOrbit(tasks, data, config.orbit_resolution)
+        self._inward: Inward | None = None
+        if data.cyclic and resolved.inward_weight > 0:
+            self._inward = Inward(data)
+
+    @property
+    def watched(self) -> Calm | None:
+        """The calm of motions that end, whose weight grows with need."""
+        return None if self.data.cyclic else self._calm
+
+    @property
+    def parameters(self) -> list[tuple[nn.Parameter, int]]:
+        """All parameters, with the axis that counts the models."""
+        return [
+            *((p, 1) for p in self.flow.parameters()),
+            *((p, 0) for p in self.latent.parameters()),
+        ]
+
+    def optimizer(self, n_steps: int, learning_rate: float) -> GuardedAdam:
+        """Return an optimizer of all parameters."""
+        return GuardedAdam(
+            self.parameters,
+            self._names,
+            n_steps=n_steps,
+            learning_rate=learning_rate,
+            max_norm=self._config.max_gradient_norm,
+        )
+
+    def step(self, adam: GuardedAdam, step: int, stage: int) -> None:
+        """Take one step of a stage."""
+        self._draws.new_step()
+        terms = _terms(self._config, step, stage, self.latent, self.data, self._draws)
+        calm, calm_weight = self._calm, self.resolved.calm_weight
+        if calm is not None:
+            terms.append((calm_weight, calm(self._draws)))
+        if self._orbit is not None and stage == ORBIT:
+            assert isinstance(self.latent, LimitCycleLatent)
+            terms.append((self.resolved.orbit_weight, self._orbit(self.latent)))
+        inward = self._inward is not None and stage == ORBIT
+        if self._inward is not None and inward:
+            terms.append((self.resolved.inward_weight, self._inward(self._draws)))
+        losses = evaluate(self.flow, self.latent, self.data, [term for _, term in terms])
+        weighted = [w * x for (w, _), x in zip(terms, losses, strict=True)]
+        judged = loss = torch.stack(weighted).sum(0)
+        if calm is not None and calm.raised:
+            # Motions that are watched end, and the calm is the last of their terms.
+            loss = loss + (calm.weight - 1) * weighted[-1]
+        if inward:  # it looks for the worst states: no measure of how training goes
+            judged = judged - weighted[-1]
+        adam.step(step, stage, loss, judged=judged)
+
+    def take(self, other: _Batch, model: int) -> None:
+        """Become one model of another batch."""
+        for (mine, axis), (theirs, _) in zip(self.parameters, other.parameters, strict=True):
+            mine.data.copy_(theirs.data.narrow(axis, model, 1))
+        if self._calm is not None and other._calm is not None:
+            self._calm.weight = other._calm.weight[model : model + 1]
+            self._calm.raised = True
+
+    def give(self, other: _Batch, model: int) -> None:
+        """Put the only model of this batch in its place in another one."""
+        for (mine, axis), (theirs, _) in zip(self.parameters, other.parameters, strict=True):
+            theirs.data.narrow(axis, model, 1).copy_(mine.data)
+
+
+def _calm_down(
+    config: ImitationFlowConfig, batch: _Batch, n_steps: int, rate: float
+) -> tuple[Calmness, list[Restart]]:
+    """Train one model on after n_steps, with the weight of its calm doubled from round to round.
+
+    Alone, so that neither its random numbers nor its neighbours' depend on each other. The rate is
+    a fraction of the learning rate, and falls where training diverges.
+    """
+    calm, more = batch.watched, math.ceil(CALM_SHARE * n_steps)
+    assert calm is not None
+    speeds, rounds = calm.watch(batch.flow, batch.latent, N_SWEEPS), 0
+    restarts: list[Restart] = []
+    while rounds < CALM_ROUNDS and bool(calm.loud(speeds)):
+        adam = batch.optimizer(more, rate * config.learning_rate)
+        for step in range(n_steps + rounds * more, n_steps + (rounds + 1) * more):
+            batch.step(adam, step, _stage(config, n_steps, batch.data))
+        adam.look(n_steps + (rounds + 1) * more)
+        restarts += [Restart(step, rate * share) for step, share in adam.restarts[0]]
+        rate = restarts[-1].rate if adam.restarts[0] else rate
+        rounds += 1
+        speeds = calm.watch(batch.flow, batch.latent, N_SWEEPS)
+    return Calmness(float(speeds), rounds), restarts
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
@@ -213,17 +332,17 @@ def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
 def _terms(
     config: ImitationFlowConfig,
     step: int,
+    stage: int,
     latent: Latent,
     data: Recordings,
     draws: Draws,
-    calm: Calm,
 ) -> list[tuple[float, Term]]:
-    """Return the weighted terms of a step."""
+    """Return the weighted terms of a step, but for the calm and the orbit."""
     q, p = N_HORIZONS, max(1, config.n_pairs // N_HORIZONS)
     if config.objective == "paper":
         return [(1.0, backward_likelihood(latent, data, draws, q, p))]
     terms: list[tuple[float, Term]] = []
-    whole = _stage(config, step, data) == WHOLE
+    whole = stage == WHOLE
     turn = step % TURNS
     weight = TURNS * config.likelihood_weight * (turn == 0) if whole else 1.0
     if weight:
@@ -244,8 +363,6 @@ def _terms(
         if config.tube_weight and turn == TURNS // 2:
             beside = tube(data, draws, max(n // 2, 1), width=config.tube_width)
             terms.append((TURNS * weight * config.tube_weight, beside))
-    if calm_weight := _resolved(config, data).calm_weight:
-        terms.append((calm_weight, calm(draws)))
     return terms
 
 
@@ -253,12 +370,11 @@ def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
     """Whether a step minimises the likelihood, whole reproductions, or the orbit's error too."""
     if config.objective == "paper":
         return LIKELIHOOD
+    resolved = _resolved(config, data)
     if data.cyclic:
-        n_steps = config.steps(cyclic=True)
-        held = _resolved(config, data).orbit_weight > 0
-        return ORBIT if held and step >= ORBIT_FRACTION * n_steps else LIKELIHOOD
-    n_steps = config.steps(cyclic=False)
-    return WHOLE if step >= config.likelihood_fraction * n_steps else LIKELIHOOD
+        held = resolved.orbit_weight > 0
+        return ORBIT if held and step >= ORBIT_FRACTION * resolved.n_steps else LIKELIHOOD
+    return WHOLE if step >= config.likelihood_fraction * resolved.n_steps else LIKELIHOOD
 
 
 def _resolved(config: ImitationFlowConfig, data: Recordings) -> Resolved:
@@ -269,7 +385,13 @@ def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:
     """Return how many random numbers a step draws at most."""
     n, d = data.n_recordings, data.n_dims
     pairs = N_HORIZONS * max(1, config.n_pairs // N_HORIZONS)
-    return 2 * N_HORIZONS + 3 * pairs + 2 * config.n_times + d * n + (d + 1) * N_CALM
+    return (
+        2 * N_HORIZONS
+        + 3 * pairs
+        + 2 * config.n_times
+        + d * n
+        + (d + 1) * (CALM_CYCLES.n_points + N_STATES if data.cyclic else CALM_ENDS.n_points)
+    )
 
 
 def _fit_noise(

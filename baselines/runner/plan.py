@@ -33,6 +33,7 @@ from iflow_gym.baselines.runner.fingerprint import (
     versions,
 )
 from iflow_gym.baselines.runner.presets import Preset, PresetError, load_settings
+from iflow_gym.baselines.runner.store import model_is_whole
 from iflow_gym.datasets.lasa import MULTI_MODELS
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.evaluate import motion_of
@@ -334,7 +335,23 @@ def is_up_to_date(cell: Cell, folder: Path) -> bool:
         found = read_result(folder / cell.path)
     except (FileNotFoundError, ResultFileError):
         return False  # what cannot be read is written anew
-    return found.ok and found.key == cell.key
+    return found.ok and found.key == cell.key and what_is_broken(cell, folder) is None
+
+
+def what_is_broken(cell: Cell, folder: Path) -> str | None:
+    """Say what is wrong with the files of a cell that has a record; None if nothing is."""
+    try:
+        found = read_result(folder / cell.path)
+    except FileNotFoundError:
+        return None
+    except ResultFileError as error:
+        return str(error).partition(": delete it")[0]
+    if found.model is None:
+        return None
+    model = (folder / cell.path).with_suffix(".safetensors")
+    if not model.is_file():
+        return f"{model} is missing, the model of the record beside it"
+    return None if model_is_whole(model) else f"{model} is no whole model file"
 
 
 def make_jobs(cells: Iterable[Cell], to_do: Collection[Cell]) -> list[Job]:

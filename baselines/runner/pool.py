@@ -20,8 +20,8 @@ from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoo
 
 from iflow_gym.baselines.runner.plan import Cell, Job
 from iflow_gym.baselines.runner.scoring import THREADS, failed_result
+from iflow_gym.baselines.runner.store import store, sweep
 from iflow_gym.baselines.runner.work import Journal, prepare_worker, run_job
-from iflow_gym.results import write_result
 
 Event = dict[str, Any]
 
@@ -74,7 +74,6 @@ class Pool:
         self._on_event = on_event
         self._started: set[int] = set()
         self._done: set[str] = set()
-        self._pids: set[int] = set()
         self._doing: dict[int, Doing] = {}
         self._overdue: dict[int, Doing] = {}
 
@@ -92,6 +91,8 @@ class Pool:
         ------
         WorkersError
             If workers die before any of them begins a job.
+        CannotWriteError
+            If the disk is full or worse. What was written before is whole.
         KeyboardInterrupt
             On Ctrl-C, after the workers were killed. Records are whole or absent.
         """
@@ -113,7 +114,7 @@ class Pool:
                         self._fail(job.cells[0], reason)
                 alone = left + alone
         finally:
-            self._sweep()
+            sweep(self._folder)
 
     def _round(self, jobs: Sequence[Job], n_workers: int) -> tuple[list[Job], list[Job], str]:
         """Run jobs in a fresh executor.
@@ -190,7 +191,6 @@ class Pool:
                 *lines, rest = rest.split("\n")
                 for line in lines:
                     event = json.loads(line)
-                    self._pids.add(event["pid"])
                     if event["event"] == "job":
                         self._started.add(event["number"])
                     elif event["event"] in ("batch", "begin"):
@@ -215,27 +215,20 @@ class Pool:
                     psutil.Process(pid).kill()
 
     def _fail(self, cell: Cell, reason: str) -> None:
-        model = self._folder / cell.path.with_suffix(".safetensors")
-        model.unlink(missing_ok=True)  # of an earlier run
-        write_result(self._folder, failed_result(cell, reason))
+        store(self._folder, failed_result(cell, reason), None)
         self._done.add(str(cell.path))
         self._on_event(
             {
                 "event": "done",
                 "pid": os.getpid(),
                 "label": cell.label,
+                "method": cell.entry.name,
                 "path": str(cell.path),
                 "reason": reason,
                 "seconds": 0.0,
+                "cpu_seconds": 0.0,
             }
         )
-
-    def _sweep(self) -> None:
-        """Remove what killed workers were writing."""
-        for path in self._folder.glob("*/*.partial"):
-            if path.name.split(".")[-2] in {str(pid) for pid in self._pids}:
-                with contextlib.suppress(OSError):
-                    path.unlink()
 
 
 @contextlib.contextmanager

@@ -94,6 +94,48 @@ class Reporter:
         self._progress.reset(self._workers[worker], description=escape(text), visible=True)
 
 
+class Spent:
+    """Adds up what each method took of a run, by the events of its workers.
+
+    Seconds are those of workers: two that work side by side for a minute spend two. Work that a
+    killed worker did not finish is not in them.
+    """
+
+    def __init__(self) -> None:
+        self.methods: dict[str, dict[str, float]] = {}
+
+    def event(self, event: dict[str, Any]) -> None:
+        """Count an event of a worker's journal."""
+        if event["event"] not in ("fitted", "done"):
+            return
+        fresh = {"cells": 0, "failed": 0, "seconds": 0.0, "cpu_seconds": 0.0}
+        row = self.methods.setdefault(event["method"], fresh)
+        if event["event"] == "done":
+            row["cells"] += 1
+            row["failed"] += event["reason"] is not None
+        row["seconds"] += event["seconds"]
+        row["cpu_seconds"] += event["cpu_seconds"]
+
+    def table(self) -> Table:
+        """Return a row for each method, the dearest first."""
+        table = Table(title="What each method took of this run, to fit and to score")
+        table.add_column("Method", no_wrap=True)
+        for title in ("Cells", "Worker s", "CPU s", "CPU s a cell", "Share"):
+            table.add_column(title, justify="right")
+        total = math.fsum(row["seconds"] for row in self.methods.values())
+        for name, row in sorted(self.methods.items(), key=lambda item: -item[1]["seconds"]):
+            each = row["cpu_seconds"] / max(1, row["cells"])
+            table.add_row(
+                escape(name),
+                f"{row['cells']:.0f}",
+                f"{row['seconds']:.1f}",
+                f"{row['cpu_seconds']:.1f}",
+                f"{each:.2f}",
+                f"{row['seconds'] / total:.1%}" if total else "-",
+            )
+        return table
+
+
 def summary(results: Sequence[Result]) -> Table:
     """Return a table of mean scores, a row for each method and protocol."""
     units = "lengths are the demonstrations' own, times in seconds"

@@ -28,6 +28,7 @@ from iflow_gym.baselines.runner.scoring import (
     scored,
     scored_reference,
 )
+from iflow_gym.baselines.runner.store import CannotWriteError, no_room, store
 from iflow_gym.partial_fits import PartialFitError
 from iflow_gym.results import Result, read_result, write_result
 
@@ -39,6 +40,10 @@ CELLS_PER_LIMIT = 4
 
 TRACEBACK_FRAMES = 4
 """Last frames of a traceback that a record keeps."""
+
+
+PARENT_SECONDS = 1.0
+"""How often a worker looks whether its parent is still there."""
 
 
 class TimeLimitExceededError(BaseException):
@@ -66,31 +71,74 @@ def prepare_worker() -> None:
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     threadpool_limits(THREADS)
+
+
+def end_with_parent() -> None:
+    """End this process soon after the one that began it, however that ended.
+
+    A parent that is killed (`kill -9`, or for want of memory) takes no leave of its workers, which
+    would go on, or wait for ever.
+    """
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent-watch", daemon=True).start()
 
 
 def run_job(number: int, job: Job, folder: Path, journal: Journal) -> None:
     """Do a job: fit its batch, together where there are several, then score and write its cells.
 
-    The journal says what begins before it does, and how long it may take.
+    The journal says what begins before it does, how long it may take, and what it took. Records and
+    models are made in a scratch folder beside the journal, and stored together.
+
+    Raises
+    ------
+    CannotWriteError
+        If the disk is full or worse: no cell fails of that, since no method can help it.
     """
     journal.write("job", number=number)
-    fits = _fit_together(number, job, journal) if len(job.batch) > 1 else {}
+    scratch = journal.path.parent / str(os.getpid())
+    fits: dict[Path, Fit] = {}
+    if len(job.batch) > 1:
+        began = _clocks()
+        fits = _fit_together(number, job, journal)
+        journal.write("fitted", method=job.batch[0].entry.name, **_taken(began))
     for cell in job.cells:
         limit = cell.time_limit
+        began = _clocks()
         path = str(cell.path)
         journal.write("begin", label=cell.label, number=number, path=path, limit=limit)
-        began = time.perf_counter()
-        result = _attempt(cell, fits.get(cell.path), folder)
         try:
-            read_result(write_result(folder, result))
-        except (TypeError, ValueError, RecursionError) as error:
-            # Something that the method says of itself is nothing that a record can hold.
-            result = _failed(cell, error, folder)
-            write_result(folder, result)
-        seconds = time.perf_counter() - began
-        reason = result.reason
-        journal.write("done", label=cell.label, path=path, reason=reason, seconds=seconds)
+            result = _attempt(cell, fits.get(cell.path), scratch)
+            try:
+                read_result(write_result(scratch, result))
+            except (TypeError, ValueError, RecursionError) as error:
+                # Something that the method says of itself is nothing that a record can hold.
+                result = _failed(cell, error)
+            model = None
+            if result.model is not None:
+                model = (scratch / cell.path).with_name(result.model).read_bytes()
+            store(folder, result, model)
+        except OSError as error:
+            raise CannotWriteError(f"{type(error).__name__}: {error}") from error
+        said = {"label": cell.label, "method": cell.entry.name, "reason": result.reason}
+        journal.write("done", path=path, **said, **_taken(began))
+
+
+def _clocks() -> tuple[float, float]:
+    return time.perf_counter(), time.process_time()
+
+
+def _taken(began: tuple[float, float]) -> dict[str, float]:
+    """Return the seconds, and this process's CPU seconds, since `_clocks` was asked."""
+    now = _clocks()
+    return {"seconds": now[0] - began[0], "cpu_seconds": now[1] - began[1]}
 
 
 def time_limit_of_batch(batch: Sequence[Cell]) -> float:
@@ -108,6 +156,8 @@ def _fit_together(number: int, job: Job, journal: Journal) -> dict[Path, Fit]:
             fits, why = _fits_of(job.batch)
         found = {c.path: fit for c, fit in zip(job.batch, fits, strict=True) if fit is not None}
     except BaseException as error:
+        if no_room(error):
+            raise CannotWriteError(f"{type(error).__name__}: {error}") from error
         found, why = {}, _reason(error, limit).splitlines()[0]
     if why:
         left = n - len(found)
@@ -128,24 +178,25 @@ def _fits_of(batch: Sequence[Cell]) -> tuple[Sequence[Fit | None], str]:
     return [None if s is None else Fit(s, cost, len(batch)) for s in systems], why
 
 
-def _attempt(cell: Cell, fitted: Fit | None, folder: Path) -> Result:
+def _attempt(cell: Cell, fitted: Fit | None, scratch: Path) -> Result:
     """Return a cell's record; whatever goes wrong in the method becomes a failed one.
 
     Whatever: Ctrl-C is the parent's, so that a KeyboardInterrupt here is the method's own.
     """
-    model = folder / cell.path.with_suffix(".safetensors")
+    model = scratch / cell.path.with_suffix(".safetensors")
     try:
         with _time_limit(cell.time_limit):
             if cell.entry.reference:
                 return scored_reference(cell)
             return scored(cell, fitted or fit_alone(cell), model)
     except BaseException as error:
-        return _failed(cell, error, folder)
+        if no_room(error):
+            raise CannotWriteError(f"{type(error).__name__}: {error}") from error
+        return _failed(cell, error)
 
 
-def _failed(cell: Cell, error: BaseException, folder: Path) -> Result:
-    """Return the record of a cell that failed, and remove the model that it does not speak of."""
-    (folder / cell.path.with_suffix(".safetensors")).unlink(missing_ok=True)
+def _failed(cell: Cell, error: BaseException) -> Result:
+    """Return the record of a cell that failed."""
     return failed_result(cell, _reason(error, cell.time_limit))
 
 

@@ -12,9 +12,10 @@ lambda = lambda_0 (1 - w / w_0) where the manipulability w = sqrt(det J J^T) is 
 Limits. dq = a + s b, b the part that v commands and a the rest. s in [0, 1] is the largest number
 with which every joint keeps its speed limit and its distance to its stops: near a stop the allowed
 approach is (distance) / 0.1 s. So a command that cannot be carried out is slowed as a whole, and
-never bent. The border of the workspace alone is slid along: what of v leads out of it faster than
-(distance) / 0.1 s is taken off, and the rest remains. Slowed as a whole a policy would stand still
-there for ever, since the tip's position is all that it goes by.
+never bent. The border of the workspace and the drums alone are slid along: what of v leads out of
+it faster than (distance) / 0.1 s is taken off, and the rest remains; for drums see `keepout`.
+Slowed as a whole a policy would stand still there for ever, since the tip's position is all that it
+goes by.
 
 Acceleration. v is not the command itself but the tip's present velocity plus the change to the
 command, shortened, along the command and across it, to `TIP_ACCELERATION` dt each. Far below what
@@ -37,6 +38,7 @@ import numpy as np
 
 from iflow_gym.demonstrations import FloatArray
 from iflow_gym.envs.drumming.engine import mujoco
+from iflow_gym.envs.drumming.keepout import KeepOut
 from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, Scene
 
 CONTROL_DT: Final = 0.01
@@ -130,6 +132,7 @@ class Controller:
 
     def __init__(self, scene: Scene, data: Any) -> None:
         self.scene, self.data = scene, data
+        self._drums = KeepOut(scene.drums)
         self._jacobian = np.zeros((6, 7))
         self._lower = scene.lower + JOINT_MARGIN
         self._upper = scene.upper - JOINT_MARGIN
@@ -154,7 +157,8 @@ class Controller:
         wanted[:, 0] = -jacobian @ resting
         wanted[3:, 0] += ORIENTATION_GAIN * self.rotation_error()
         velocity = self._eased(velocity, jacobian)
-        allowed = Workspace.slid(data.site_xpos[self.scene.tip], velocity)
+        tip = data.site_xpos[self.scene.tip]
+        allowed = Workspace.slid(tip, self._drums.slid(tip, velocity))
         wanted[:3, 1] = allowed
         task = jacobian.T @ np.linalg.solve(self._damped(jacobian), wanted)
         low, high = self.speed_limits()

@@ -213,6 +213,7 @@ class TestModel:
             ({"n_layers": 0}, "n_layers >= 1, got 0"),
             ({"learning_rate": -1.0}, "learning_rate > 0, got -1.0"),
             ({"likelihood_fraction": 2.0}, "likelihood_fraction in"),
+            ({"objective": "paper", "orbit_weight": 0.2}, "no orbit_weight with objective='paper'"),
         ],
     )
     def test_settings_are_checked(self, settings, message):

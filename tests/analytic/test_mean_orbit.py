@@ -84,7 +84,11 @@ def test_defaults_are_of_the_kind_of_motion() -> None:
     assert (plane, ends) == (IN_PLANE, ENDS)
     assert ImitationFlowConfig(objective="paper").resolved(cyclic=True, n_dims=3) == IN_PLANE
     given = ImitationFlowConfig(orbit_weight=0.0, calm_weight=0.5, min_decay=1.0)
-    assert given.resolved(cyclic=True, n_dims=3) == (0.5, 0.0, 1.0)
+    found = given.resolved(cyclic=True, n_dims=3)
+    assert (found.calm_weight, found.orbit_weight, found.min_decay) == (0.5, 0.0, 1.0)
+    assert found.inward_weight == 0.0  # it belongs to the orbit's stage
+    with pytest.raises(ValueError, match="an orbit_weight > 0 with inward_weight"):
+        ImitationFlowConfig(inward_weight=1.0).resolved(cyclic=True, n_dims=2)
 
 
 def test_a_cycle_in_space_comes_back_within_a_period() -> None:

@@ -6,8 +6,8 @@ A change that moves a hash changes what an id means: bump its -vN, then write th
 
 Each rollout is played in every control mode that the id has, pushed, from a random start, with
 actions within and beyond the box. Observations and rewards are rounded to 6 decimals before
-hashing: arithmetic is the same bits wherever IEEE 754 is, and what is not (exp, the generators'
-normal numbers) differs far below that.
+hashing: arithmetic is the same bits wherever IEEE 754 is, and what is not (exp, the normal numbers
+of generators) differs far below that.
 """
 
 from __future__ import annotations

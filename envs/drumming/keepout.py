@@ -1,0 +1,68 @@
+r"""Where a command does not lead the stick: into a drum's side, or deep into its head.
+
+A head gives way, and a stroke follows through it; but a policy that sees the tip alone may command
+it on and on into the drum, and there it would stay pressed. So below `FOLLOW_THROUGH` under a head
+the drum counts as a solid cylinder, along which the command slides: what of it leads towards the
+cylinder faster than (distance) / `BRAKING_TIME` is taken off, the rest remains. The tip is a
+sphere, so the cylinder is wider than the drum by its radius.
+
+With r the horizontal distance from the drum's axis, outside means above the face, r <= R and
+z >= f, or beside the wall, r >= R. Below the face and within the wall, the nearer of the two leads
+out. What a wall takes off a command it gives back upwards, up to `CLIMB`: in the wedge between a
+wall and the border of the workspace nothing would be left to slide with, and over a drum the way is
+free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import hypot
+from typing import Final
+
+import numpy as np
+
+from iflow_gym.datasets.drums import TIP_RADIUS, Drum
+from iflow_gym.demonstrations import FloatArray
+
+FOLLOW_THROUGH: Final = 0.016
+"""How far a command may lead into a head, in m; the demonstrations' strokes end 11 to 14 mm in."""
+
+BRAKING_TIME: Final = 0.03
+"""The tip may approach a drum at the distance to it over this many seconds: a stroke is not
+slowed before it meets the head."""
+
+CLIMB: Final = 0.1
+"""Speed in m/s at most that a wall adds upwards."""
+
+RIM: Final = 0.007
+"""How much wider than its head a drum is, in m."""
+
+
+class KeepOut:
+    """The drums as obstacles of a tip's commands."""
+
+    def __init__(self, drums: Sequence[Drum]) -> None:
+        self._solids = [
+            (*drum.head[:2], drum.head[2] + TIP_RADIUS - FOLLOW_THROUGH,
+             drum.radius + RIM + TIP_RADIUS)
+            for drum in drums
+        ]  # fmt: skip
+
+    def slid(self, point: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the part of a velocity, shape (3,), that is allowed with the tip at a point."""
+        x, y, z = point.tolist()
+        for centre_x, centre_y, face, wall in self._solids:
+            across, along = x - centre_x, y - centre_y
+            r = hypot(across, along)
+            above, beside = z - face, r - wall
+            if beside <= 0.0 and above >= beside:
+                least = -above / BRAKING_TIME
+                if velocity[2] < least:
+                    velocity = np.array([velocity[0], velocity[1], least])
+            elif above < 0.0:
+                out = np.array([across / r, along / r, 0.0])
+                least, towards = -beside / BRAKING_TIME, float(out @ velocity)
+                if towards < least:
+                    velocity = velocity + (least - towards) * out
+                    velocity[2] += min(least - towards, CLIMB)
+        return velocity

@@ -1,0 +1,98 @@
+"""Statistics of a board: which competitors can be told apart, on the metric it is known by."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from board import MAIN, Board, Row
+
+from iflow_gym.metrics import get_metric
+from iflow_gym.statistics import (
+    Improvement,
+    Profile,
+    RankComparison,
+    compare_ranks,
+    performance_profile,
+    probability_of_improvement,
+)
+
+FEWEST_ENVIRONMENTS = 10
+"""Below this the tests of ranks, which are asymptotic, are not made (Demšar 2006, sec. 3.2.2)."""
+
+N_THRESHOLDS = 80
+"""Points of a profile."""
+
+
+def tried(board: Board) -> list[str]:
+    """Return the environments that any competitor was run on."""
+    ran = {environment for row in board.competitors for environment, _ in row.cells}
+    return [environment for environment in board.environments if environment in ran]
+
+
+def compared(board: Board) -> list[Row]:
+    """Return the competitors that the main metric applies to, failed ones included."""
+    metric = MAIN[board.motion]
+    return [row for row in board.competitors if row.applies(metric) or not row.n_scored]
+
+
+def rank_comparison(board: Board) -> RankComparison | None:
+    """Return Friedman's and Nemenyi's tests by the main metric; a block is an environment.
+
+    A score of a block is the mean over the seeds, so that seeds do not count as data sets of their
+    own. None below `FEWEST_ENVIRONMENTS`, or three methods.
+    """
+    metric, rows, kept = MAIN[board.motion], compared(board), tried(board)
+    if len(kept) < FEWEST_ENVIRONMENTS or len(rows) < 3:
+        return None
+    places = [board.environments.index(environment) for environment in kept]
+    scores = np.stack([row.by_environment(metric)[places] for row in rows])
+    return compare_ranks(scores, get_metric(metric).better)
+
+
+def improvements(board: Board) -> dict[tuple[str, str], Improvement]:
+    """Return how likely each competitor is better than each other by the main metric."""
+    metric, kept = MAIN[board.motion], tried(board)
+    scores = {row.method: row.scores(metric) for row in compared(board)}
+    better = get_metric(metric).better
+    return {
+        (one, other): probability_of_improvement(
+            [scores[one][e] for e in kept], [scores[other][e] for e in kept], better
+        )
+        for one in scores
+        for other in scores
+        if one != other and kept
+    }
+
+
+def profiles(board: Board) -> dict[str, Profile]:
+    """Return the distributions of all fitted methods' scores by the main metric.
+
+    Thresholds span the finite scores, evenly on a logarithmic scale where all are positive and the
+    metric is an error, and else evenly.
+    """
+    metric = MAIN[board.motion]
+    rows = [row for row in board.methods if row.applies(metric)]
+    ran = {environment for row in rows for environment, _ in row.cells}
+    kept = [environment for environment in board.environments if environment in ran]
+    if not rows or len(kept) < 2:
+        return {}
+    scores = {row.method: row.scores(metric) for row in rows}
+    pooled = np.concatenate([np.concatenate([s[e] for e in kept]) for s in scores.values()])
+    finite = pooled[np.isfinite(pooled)]
+    better = get_metric(metric).better
+    if better == "lower" and (finite > 0).all() and len(finite):
+        low, high = math.log(float(finite.min())), math.log(float(finite.max()))
+        at = np.exp(np.linspace(low - 0.03 * (high - low), high, N_THRESHOLDS))
+        at[-1] = max(at[-1], finite.max())
+    else:
+        at = np.linspace(0.0, float(finite.max(initial=1.0)), N_THRESHOLDS)
+    return {
+        name: performance_profile([own[e] for e in kept], at, better)
+        for name, own in scores.items()
+    }
+
+
+def is_logarithmic(found: dict[str, Profile]) -> bool:
+    """Whether profiles' thresholds are evenly spaced on a logarithmic scale."""
+    return all(profile.thresholds[0] > 0 for profile in found.values())

@@ -1,0 +1,91 @@
+"""The drums as obstacles of commands: closed forms, invariants, and what an arm does with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iflow_gym.datasets.drums import DRUMS, LEFT, RIGHT, TIP_RADIUS
+from iflow_gym.envs.drumming.env import DrummingEnv
+from iflow_gym.envs.drumming.keepout import BRAKING_TIME, CLIMB, FOLLOW_THROUGH, RIM, KeepOut
+
+FACE = RIGHT.head[2] + TIP_RADIUS - FOLLOW_THROUGH
+WALL = RIGHT.radius + RIM + TIP_RADIUS
+OVER = np.array([RIGHT.head[0] + 0.02, RIGHT.head[1], FACE])
+coordinate = st.floats(-0.5, 0.5)
+vector = st.tuples(coordinate, coordinate, coordinate).map(np.array)
+
+
+def depth(point):
+    """How deep a point is in the solid of the right drum; negative outside."""
+    r = np.hypot(*(point[:2] - RIGHT.head[:2]))
+    return min(FACE - point[2], WALL - r)
+
+
+def test_down_onto_a_head_is_slowed_towards_the_face_and_across_it_free():
+    keep = KeepOut((RIGHT,))
+    above = OVER + np.array([0.0, 0.0, 0.006])
+    np.testing.assert_allclose(
+        keep.slid(above, np.array([0.3, -0.1, -0.5])), [0.3, -0.1, -0.006 / BRAKING_TIME]
+    )
+    np.testing.assert_array_equal(keep.slid(above, np.array([0.3, 0.0, -0.1])), [0.3, 0.0, -0.1])
+
+
+def test_into_a_wall_a_command_slides_along_it_and_up():
+    keep = KeepOut((RIGHT,))
+    beside = np.array([RIGHT.head[0], RIGHT.head[1] - WALL, 0.18])
+    np.testing.assert_allclose(
+        keep.slid(beside, np.array([0.2, 0.04, 0.1])), [0.2, 0.0, 0.14], atol=1e-12
+    )
+    fast = keep.slid(beside, np.array([0.2, 0.4, 0.1]))
+    np.testing.assert_allclose(fast, [0.2, 0.0, 0.1 + CLIMB], atol=1e-12)
+    away = np.array([0.2, -0.4, 0.1])
+    np.testing.assert_array_equal(keep.slid(beside, away), away)
+
+
+def test_deep_inside_a_command_leads_out_the_nearer_way():
+    keep = KeepOut((RIGHT,))
+    pressed = keep.slid(OVER - np.array([0.0, 0.0, 0.003]), np.array([0.1, 0.0, -0.2]))
+    assert pressed[2] == pytest.approx(0.003 / BRAKING_TIME)
+    assert pressed[0] == 0.1
+
+
+@given(point=vector, velocity=vector)
+def test_no_command_leads_deeper_in_than_the_distance_allows(point, velocity):
+    point = point + RIGHT.head
+    dt = 0.01
+    moved = point + dt * KeepOut((RIGHT,)).slid(point, velocity)
+    # A curved wall gives way to second order in the step beside it.
+    assert depth(moved) <= max(depth(point), 0.0) + 1e-12 or depth(point) > 0
+
+
+@given(point=vector, velocity=vector)
+def test_nothing_but_a_climb_is_added_to_a_command_outside(point, velocity):
+    point = point + RIGHT.head
+    if depth(point) <= 0:
+        slid = KeepOut(DRUMS).slid(point, velocity)
+        if depth_of(LEFT, point) <= 0:
+            assert np.linalg.norm(slid[:2]) <= np.linalg.norm(velocity[:2]) + 1e-12
+            assert slid[2] >= velocity[2]
+            assert slid[2] <= max(velocity[2], 0.0) + 2 * CLIMB + 1e-12
+
+
+def depth_of(drum, point):
+    r = np.hypot(*(point[:2] - drum.head[:2]))
+    return min(FACE - point[2], drum.radius + RIM + TIP_RADIUS - r)
+
+
+def test_an_arm_that_is_led_through_a_head_slides_off_it():
+    """Straight down and across: pressed into the head it would stay there for ever."""
+    env = DrummingEnv(horizon=400)
+    observation, _ = env.reset(options={"start": [0.68, -0.14, 0.32]})
+    velocity = np.array([0.0, -0.1, -0.15])
+    depths = []
+    for _ in range(300):
+        observation, *_ = env.step(env.command_to_action(velocity, observation))
+        depths.append(FACE - observation[2])
+    over = np.hypot(*(observation[:2] - RIGHT.head[:2])) < RIGHT.radius
+    assert not over
+    assert depths[60] < 0.004  # of a tip that is over the head all the while
