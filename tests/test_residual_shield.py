@@ -212,25 +212,30 @@ def test_on_the_cycle_the_tempo_is_the_agents_at_the_environments_dt(letter):
     lyapunov = FlowLyapunov(letter)
     envs = gymnasium.make_vec("iflow/Letter-O-v0", 8, "vector_entry_point", horizon=1000)
     on_it = letter.rollout(load_letter("O").positions[0][0], 4000, 0.01)[-1]
-    turned = {}
+    way = {}
     for faster in (-0.5, 0.0, 0.5):
         wrapped = ResidualActionWrapper(envs, letter, scale=0.2, stable=True)
         _, info = wrapped.reset(seed=0, options={"start": on_it})
-        values, base = [], info["base_command"]
-        for _ in range(20):  # less than half a round, even in haste
+        base, angles = info["base_command"], [_angle(letter, on_it)]
+        for _ in range(20):
             action = faster * base / (0.2 * envs.unwrapped.max_speed)
             _, _, _, _, info = wrapped.step(action)
             x = np.stack(envs.unwrapped._state, axis=-1)
-            values.append(lyapunov.value(x).max())
+            assert lyapunov.value(x).max() <= lyapunov.floor * (1 + 1e-9)
+            angles.append(_angle(letter, x[0]))
             base = wrapped._command
-        assert max(values) <= lyapunov.floor * (1 + 1e-9)
-        z = letter._encode(x)[0][0]
-        turned[faster] = np.arctan2(z[1], z[0])
-    start = letter._encode(on_it[None])[0][0]
-    begin = np.arctan2(start[1], start[0])
-    way = {k: abs((v - begin + np.pi) % (2 * np.pi) - np.pi) for k, v in turned.items()}
-    assert way[-0.5] < 0.75 * way[0.0]
-    assert way[0.5] > 1.25 * way[0.0]
+        # Steps are far shorter than half a round, and so are told from what is beyond it.
+        way[faster] = float(np.unwrap(angles)[-1] - angles[0])
+    expected = 2 * np.pi * 20 * float(info["dt"][0]) / letter.period_
+    assert abs(way[0.0]) == pytest.approx(expected, rel=0.02)
+    assert 0.4 < way[-0.5] / way[0.0] < 0.6
+    assert way[0.5] / way[0.0] > 1.2
+
+
+def _angle(system, x):
+    """Return the angle of a state round the latent cycle, in radians."""
+    z = system._encode(x[None])[0][0]
+    return np.arctan2(z[1], z[0])
 
 
 def test_bad_arguments_say_what_was_expected(angle):
