@@ -11,7 +11,6 @@ import dataclasses
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +21,7 @@ import gymnasium
 from iflow_gym.baselines.registry import load_method
 from iflow_gym.baselines.residual_learning.artifacts import AGENT, CARD, load_residual
 from iflow_gym.baselines.residual_learning.settings import TrainingSettings
-from iflow_gym.baselines.residual_learning.tasks import returns_of
+from iflow_gym.baselines.residual_learning.tasks import performance
 from iflow_gym.baselines.residual_learning.training import Trained, train
 from iflow_gym.baselines.runner.fingerprint import (
     CORE_LIBRARIES,
@@ -113,8 +112,8 @@ def with_returns(folder: Path, environment: str, seed: int) -> Result:
     if record.returns:
         return record
     system: Any = load_method(BASE).load(model)
-    found = returns_of(Zero(system.n_dims_), environment, system, 1.0, False)
-    record = dataclasses.replace(record, returns=_statistics(found))
+    found = performance(Zero(system.n_dims_), environment, system, 1.0, False)
+    record = dataclasses.replace(record, returns=found)
     write_result(folder, record)
     return record
 
@@ -206,7 +205,7 @@ def _scored(
     began = time.perf_counter()
     found = evaluate(policy, task, seed=seed, protocol=PROTOCOL)
     seconds = time.perf_counter() - began
-    returns = returns_of(policy.agent, environment, policy.base_policy, card.scale, card.shield)
+    returns = performance(policy.agent, environment, policy.base_policy, card.scale, card.shield)
     values = found.metrics | {
         "fit_seconds": trained.wall_seconds,
         "fit_cpu_seconds": trained.cpu_seconds,
@@ -230,7 +229,7 @@ def _scored(
         metrics=metrics,
         medians=found.medians,
         per_demonstration=found.per_demonstration,
-        returns=_statistics(returns),
+        returns=returns,
         guarantee=row.guarantee(exact),
         target="iflow_gym.baselines.residual_learning.artifacts:load_residual",
         config={**card.settings, "stable": row.stable, "base": card.base},
@@ -249,11 +248,3 @@ def _scored(
         hardware=hardware(1),
     )
 
-
-def _statistics(returns: Any) -> dict[str, float]:
-    values: Sequence[float] = [float(v) for v in returns]
-    return {
-        "mean": sum(values) / len(values),
-        "least": min(values),
-        "greatest": max(values),
-    }

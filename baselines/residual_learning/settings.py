@@ -15,6 +15,9 @@ FOLDER = Path(__file__).parents[1] / "presets" / "residual"
 Algorithm = Literal["ppo", "sac", "td3"]
 ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)
 
+Reward = Literal["environment", "hits"]
+REWARDS: tuple[Reward, ...] = get_args(Reward)
+
 
 class SettingsError(ValueError):
     """A preset or a setting is not understood."""
@@ -34,6 +37,9 @@ class TrainingSettings:
     """Largest residual in greatest speeds."""
     scratch_scale: float = 0.4
     """The same where there is no base: twice the peak speed of recordings in the plane."""
+    reward: Reward = "environment"
+    """What is learned from: the environment's own reward, or for drumming "hits", that of
+    `iflow_gym.envs.hit_reward.HitReward`."""
     reward_scale: float = 1.0
     """What rewards are multiplied by for the agent. With 1 - gamma the values that it learns are of
     order 1, and do not drown the policy's gradient where both are clipped together."""
@@ -58,6 +64,10 @@ class TrainingSettings:
         if self.algorithm not in ALGORITHMS:
             raise SettingsError(
                 f"Expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}."
+            )
+        if self.reward not in REWARDS:
+            raise SettingsError(
+                f"Expected a reward of {', '.join(REWARDS)}, got {self.reward!r}."
             )
         for name in ("total_steps", "num_envs", "n_evaluations", "n_checkpoints"):
             if not (isinstance(value := getattr(self, name), int) and value >= 1):

@@ -168,6 +168,7 @@ def _learn(
         card.scale,
         card.shield,
         settings.reward_scale,
+        settings.reward,
     )
     curves = folder / "tensorboard" if tensorboard else None
     agent = make_agent(settings, env, card.seed + card.steps, curves)
@@ -235,7 +236,14 @@ class EvaluateCallback(BaseCallback):
         """Evaluate now."""
         card = self._card
         assert self.model is not None
-        returns = returns_of(self.model, card.environment, self._base, card.scale, card.shield)
+        returns = returns_of(
+            self.model,
+            card.environment,
+            self._base,
+            card.scale,
+            card.shield,
+            settings_of(card).reward,
+        )
         mean = float(returns.mean())
         self.found.append({"steps": int(self.model.num_timesteps), "mean_reward": mean})
         if mean >= max(entry["mean_reward"] for entry in self.found):
