@@ -20,6 +20,8 @@ from iflow_gym.residual.policy import Zero
 
 pytest.importorskip("stable_baselines3")
 
+from stable_baselines3 import PPO
+
 from iflow_gym.baselines.residual_learning import records, training
 from iflow_gym.baselines.residual_learning.agents import AgentFileError
 from iflow_gym.baselines.residual_learning.artifacts import (
@@ -52,7 +54,8 @@ def _short_evaluations(monkeypatch, request):
     """Evaluations on the way take thousands of steps: what they measure has a test of its own."""
     if "returns" not in request.node.name:
         monkeypatch.setattr(training, "returns_of", lambda *_: np.full(7, 0.5))
-        monkeypatch.setattr(records, "returns_of", lambda *_: np.linspace(0.1, 0.7, 7))
+        spread = {"mean": 0.4, "least": 0.1, "greatest": 0.7}
+        monkeypatch.setattr(records, "performance", lambda *_: dict(spread))
 
 
 @pytest.fixture(scope="module")
@@ -335,9 +338,9 @@ def test_returns_are_of_the_recordings_own_episodes(model):
 
 
 def test_presets_and_settings_say_what_is_wrong(tmp_path):
-    assert set(known_presets()) == set(ALGORITHMS)
+    assert set(known_presets()) == {*ALGORITHMS, "drumming"}
     assert load_settings("ppo", total_steps=7, scale=None).total_steps == 7
-    with pytest.raises(SettingsError, match="ppo, sac, td3 or a path"):
+    with pytest.raises(SettingsError, match="drumming, ppo, sac, td3 or a path"):
         load_settings("dqn")
     path = tmp_path / "own.toml"
     path.write_text('[training]\nalgorithm = "ppo"\nsteps = 3\n')
@@ -381,12 +384,17 @@ def test_rows_become_records_on_the_bases_of_the_leaderboard(model, tmp_path, mo
     assert "measured, not proved" in record.guarantee.reason
     assert record.returns["least"] <= record.returns["mean"] <= record.returns["greatest"]
     folder = tmp_path / "imitation-flow+stable-residual"
-    assert (folder / "Disturbed-Angle-v0.reproduction.seed0.zip").is_file()
+    slim = folder / "Disturbed-Angle-v0.reproduction.seed0.zip"
+    reloaded = PPO.load(slim, device="cpu")  # Stable-Baselines3's own format
+    assert not reloaded.policy.optimizer.state
+    assert slim.stat().st_size < 40_000
     monkeypatch.setattr(records, "train", None)
     assert records.make_record(tmp_path, row, ENV, 0, few()) == record
     with pytest.raises(TypeError):
         records.make_record(tmp_path, row, ENV, 0, few(scale=0.2))
-    kinds = {r.name: r.guarantee(True).kind for r in records.rows("ppo").values()}
+    assert "tube" not in record.guarantee.reason
+    assert "a tube of 2% of" in row.guarantee(False, True).reason
+    kinds = {r.name: r.guarantee(True, False).kind for r in records.rows("ppo").values()}
     assert kinds == {
         "imitation-flow+residual": "none",
         "imitation-flow+stable-residual": "proved",

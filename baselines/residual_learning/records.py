@@ -18,8 +18,10 @@ from typing import Any
 
 import gymnasium
 
+from iflow_gym.baselines.imitation_flow.lyapunov import TUBE
 from iflow_gym.baselines.registry import load_method
-from iflow_gym.baselines.residual_learning.artifacts import AGENT, CARD, load_residual
+from iflow_gym.baselines.residual_learning.agents import save_slim
+from iflow_gym.baselines.residual_learning.artifacts import CARD, load_residual
 from iflow_gym.baselines.residual_learning.settings import TrainingSettings
 from iflow_gym.baselines.residual_learning.tasks import performance
 from iflow_gym.baselines.residual_learning.training import Trained, train
@@ -35,7 +37,7 @@ from iflow_gym.baselines.runner.fingerprint import (
 from iflow_gym.baselines.runner.plan import entry_points, family
 from iflow_gym.evaluate import evaluate, motion_of
 from iflow_gym.metrics import metrics_hash, metrics_of
-from iflow_gym.residual.policy import Zero
+from iflow_gym.residual.policy import ResidualPolicy, Zero
 from iflow_gym.residual.shield import RATE_SHARE
 from iflow_gym.results import Result, check_metrics, read_result, result_path, write_result
 from iflow_gym.system import Guarantee
@@ -49,6 +51,9 @@ PROTOCOL = "reproduction"
 MODULE = "iflow_gym.baselines.residual_learning.training"
 """Module whose code, and what it imports, decides what is learned."""
 
+REWARDS = ("iflow_gym.envs.guide", "iflow_gym.envs.hit_reward")
+"""Modules of rewards: no part of what scores a method, but of what these learn from."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -61,7 +66,7 @@ class Row:
     scratch: bool = False
     """Whether there is no base."""
 
-    def guarantee(self, velocity_mode: bool) -> Guarantee:
+    def guarantee(self, velocity_mode: bool, cyclic: bool) -> Guarantee:
         """Return what is known about its stability."""
         if self.stable is None:
             what = "nothing is under the agent" if self.scratch else "the agent may oppose the base"
@@ -71,11 +76,18 @@ class Row:
             if velocity_mode
             else "How closely the plant follows its command is measured, not proved."
         )
+        falls = (
+            f"V(x + dt u) <= exp(-rho dt) V(x) with rho {self.stable:g} of the base's slowest rate"
+        )
+        if cyclic:
+            falls = (
+                f"outside a tube of {TUBE:.0%} of the latent radius round the cycle {falls}; "
+                "inside V stays below the tube's level"
+            )
         return Guarantee(
             "proved",
-            "Of the commanded velocity u: V of the base falls at every step, V(x + dt u) <= "
-            f"exp(-rho dt) V(x) with rho {self.stable:g} of the base's slowest rate, or as the "
-            f"base alone, whatever the agent wants. {plant}",
+            f"Of the commanded velocity u, V the base's squared latent distance: {falls}; or u is "
+            f"the base's own, whatever the agent wants. {plant}",
         )
 
 
@@ -155,9 +167,10 @@ def make_record(
             progress=progress,
             tensorboard=runs is not None,
         )
-        record = _scored(row, environment, task, seed, trained, hashes, used, key)
+        policy = load_residual(place)
+        record = _scored(policy, row, environment, task, seed, trained, hashes, used, key)
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(place / AGENT, target.with_suffix(".zip"))
+        save_slim(policy.agent, target.with_suffix(".zip"))
         shutil.copyfile(place / CARD, target.with_suffix(".card.json"))
     write_result(folder, record)
     return record
@@ -178,7 +191,7 @@ def _identity(
     hashes = {
         "data": task.demonstrations.sha256,
         "metrics": metrics_hash(motion),
-        "code": code.sha256,
+        "code": sha256_of([code.sha256, *(method_code(name).sha256 for name in REWARDS)]),
         "core": core_hash(entry_points(environment), motion),
         "config": sha256_of(config),
     }
@@ -191,6 +204,7 @@ def _identity(
 
 
 def _scored(
+    policy: ResidualPolicy,
     row: Row,
     environment: str,
     task: Any,
@@ -200,7 +214,6 @@ def _scored(
     used: dict[str, str],
     key: str,
 ) -> Result:
-    policy = load_residual(trained.folder)
     card = trained.card
     began = time.perf_counter()
     found = evaluate(policy, task, seed=seed, protocol=PROTOCOL)
@@ -230,7 +243,7 @@ def _scored(
         medians=found.medians,
         per_demonstration=found.per_demonstration,
         returns=returns,
-        guarantee=row.guarantee(exact),
+        guarantee=row.guarantee(exact, task.demonstrations.period is not None),
         target="iflow_gym.baselines.residual_learning.artifacts:load_residual",
         config={**card.settings, "stable": row.stable, "base": card.base},
         integrator="its base's command and the agent's",
@@ -247,4 +260,3 @@ def _scored(
         versions=used,
         hardware=hardware(1),
     )
-

@@ -66,9 +66,7 @@ class TrainingSettings:
                 f"Expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}."
             )
         if self.reward not in REWARDS:
-            raise SettingsError(
-                f"Expected a reward of {', '.join(REWARDS)}, got {self.reward!r}."
-            )
+            raise SettingsError(f"Expected a reward of {', '.join(REWARDS)}, got {self.reward!r}.")
         for name in ("total_steps", "num_envs", "n_evaluations", "n_checkpoints"):
             if not (isinstance(value := getattr(self, name), int) and value >= 1):
                 raise SettingsError(f"Expected {name} >= 1, a whole number, got {value!r}.")
