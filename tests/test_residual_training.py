@@ -15,14 +15,13 @@ from rich.console import Console
 
 from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.model_files import ModelFileError
 from iflow_gym.residual import ResidualVectorWrapper
 from iflow_gym.residual.policy import Zero
 
 pytest.importorskip("stable_baselines3")
 
-from stable_baselines3 import PPO
-
-from iflow_gym.baselines.residual_learning import records, training
+from iflow_gym.baselines.residual_learning import recorded, records, training
 from iflow_gym.baselines.residual_learning.agents import AgentFileError
 from iflow_gym.baselines.residual_learning.artifacts import (
     AGENT,
@@ -384,10 +383,17 @@ def test_rows_become_records_on_the_bases_of_the_leaderboard(model, tmp_path, mo
     assert "measured, not proved" in record.guarantee.reason
     assert record.returns["least"] <= record.returns["mean"] <= record.returns["greatest"]
     folder = tmp_path / "imitation-flow+stable-residual"
-    slim = folder / "Disturbed-Angle-v0.reproduction.seed0.zip"
-    reloaded = PPO.load(slim, device="cpu")  # Stable-Baselines3's own format
-    assert not reloaded.policy.optimizer.state
-    assert slim.stat().st_size < 40_000
+    file = folder / str(record.model)
+    assert file.stat().st_size < 60_000
+    policy = recorded.load_recorded(file)
+    assert isinstance(policy.base_policy, ImitationFlow)
+    assert policy.stable == row.stable
+    with pytest.raises(FileNotFoundError, match="Expected the base of"):
+        recorded.load_recorded(file, tmp_path / "absent.safetensors")
+    with pytest.raises(AgentFileError, match="corrections belong to that base alone"):
+        recorded.load_recorded(file, file)
+    with pytest.raises(ModelFileError, match="no whole 'imitation-flow' model"):
+        recorded.load_recorded(model)
     monkeypatch.setattr(records, "train", None)
     assert records.make_record(tmp_path, row, ENV, 0, few()) == record
     with pytest.raises(TypeError):

@@ -7,7 +7,6 @@ JSON, and only its tensors are read (``torch.load(weights_only=True)``).
 
 from __future__ import annotations
 
-import io
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -61,7 +60,7 @@ def read_agent(
     AgentFileError
         If the file is no agent of these settings and spaces.
     """
-    env = _spaces_only(observation_space, action_space, settings.num_envs)
+    env = spaces_only(observation_space, action_space, settings.num_envs)
     agent = make_agent(settings, env, 0, None)
     set_parameters(agent, path)
     return agent
@@ -81,34 +80,12 @@ def set_parameters(agent: Any, path: Path) -> None:
         ) from error
 
 
-def save_slim(agent: Any, path: Path) -> None:
-    """Write an agent in Stable-Baselines3's format, compressed, its optimizers as when begun.
-
-    What an optimizer remembers is two thirds of a file and of use to further training alone: kept
-    in a run's own folder, not beside a record. The agent itself forgets it, too.
-    """
-    for name in agent._get_torch_save_params()[0]:
-        part = agent
-        for attribute in name.split("."):
-            part = getattr(part, attribute)
-        if isinstance(part, torch.optim.Optimizer):
-            part.state.clear()
-    full = io.BytesIO()
-    agent.save(full)
-    with (
-        zipfile.ZipFile(full) as source,
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target,
-    ):
-        for entry in source.namelist():
-            target.writestr(entry, source.read(entry), compresslevel=9)
-
-
 def one_thread() -> None:
     """Let torch use one thread: small networks gain nothing from more."""
     torch.set_num_threads(1)
 
 
-def _spaces_only(observation_space: Any, action_space: Any, num_envs: int) -> Any:
+def spaces_only(observation_space: Any, action_space: Any, num_envs: int) -> Any:
     """Return environments that have spaces and are never stepped."""
     from stable_baselines3.common.vec_env import DummyVecEnv
 

@@ -20,8 +20,8 @@ import gymnasium
 
 from iflow_gym.baselines.imitation_flow.lyapunov import TUBE
 from iflow_gym.baselines.registry import load_method
-from iflow_gym.baselines.residual_learning.agents import save_slim
-from iflow_gym.baselines.residual_learning.artifacts import CARD, load_residual
+from iflow_gym.baselines.residual_learning.artifacts import load_residual, settings_of
+from iflow_gym.baselines.residual_learning.recorded import write_recorded
 from iflow_gym.baselines.residual_learning.settings import TrainingSettings
 from iflow_gym.baselines.residual_learning.tasks import performance
 from iflow_gym.baselines.residual_learning.training import Trained, train
@@ -143,8 +143,8 @@ def make_record(
 ) -> Result:
     """Train and score a row on an environment, and write its record and what was trained.
 
-    Beside the record lie the agent, ``.zip``, and its card, ``.card.json``; `runs` keeps the whole
-    folder of the training, its curves and checkpoints.
+    Beside the record lies the agent (`recorded`), whose base is the model beside the record of the
+    base; `runs` keeps the whole folder of the training, its curves and checkpoints.
     """
     task: Any = gymnasium.make(environment).unwrapped
     base, model = base_record(folder, environment, seed)
@@ -170,8 +170,7 @@ def make_record(
         policy = load_residual(place)
         record = _scored(policy, row, environment, task, seed, trained, hashes, used, key)
         target.parent.mkdir(parents=True, exist_ok=True)
-        save_slim(policy.agent, target.with_suffix(".zip"))
-        shutil.copyfile(place / CARD, target.with_suffix(".card.json"))
+        write_recorded(target.with_suffix(".safetensors"), row.name, policy, trained.card)
     write_result(folder, record)
     return record
 
@@ -187,7 +186,7 @@ def _identity(
     """Return hashes of what decides the scores, the libraries' versions, and the key of both."""
     motion = motion_of(task)
     code = method_code(MODULE)
-    config = {**settings.as_json(), "stable": row.stable, "base": None if row.scratch else BASE}
+    config = _config(row, settings)
     hashes = {
         "data": task.demonstrations.sha256,
         "metrics": metrics_hash(motion),
@@ -203,6 +202,10 @@ def _identity(
     return hashes, used, sha256_of(decisive)
 
 
+def _config(row: Row, settings: TrainingSettings) -> dict[str, Any]:
+    return {**settings.as_json(), "stable": row.stable, "base": None if row.scratch else BASE}
+
+
 def _scored(
     policy: ResidualPolicy,
     row: Row,
@@ -215,6 +218,7 @@ def _scored(
     key: str,
 ) -> Result:
     card = trained.card
+    place = result_path(row.name, environment, PROTOCOL, seed)
     began = time.perf_counter()
     found = evaluate(policy, task, seed=seed, protocol=PROTOCOL)
     seconds = time.perf_counter() - began
@@ -244,8 +248,9 @@ def _scored(
         per_demonstration=found.per_demonstration,
         returns=returns,
         guarantee=row.guarantee(exact, task.demonstrations.period is not None),
-        target="iflow_gym.baselines.residual_learning.artifacts:load_residual",
-        config={**card.settings, "stable": row.stable, "base": card.base},
+        target="iflow_gym.baselines.residual_learning.recorded:load_recorded",
+        config=_config(row, settings_of(card)),
+        model=place.with_suffix(".safetensors").name,
         integrator="its base's command and the agent's",
         dt=task.demonstrations.mean_dt,
         fit={
