@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from iflow_gym.baselines.imitation_flow.calm import Calmness, calmness_of
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Frame, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
@@ -58,6 +59,8 @@ class ConditionalImitationFlow:
         The contexts that were fitted.
     goals_ : array, shape (motions, d)
         The goal in each.
+    calm_ : Calmness or None
+        How calm the fitted contexts are together.
 
     Examples
     --------
@@ -166,6 +169,7 @@ class ConditionalImitationFlow:
         system = ImitationFlow(self.config)
         system.n_dims_, system.goal_, system.period_ = len(end), end, None
         system.restarts_ = self._trained.restarts
+        system.calm_ = None  # that is of all contexts together
         system._adopt(
             {
                 **self._trained.arrays(torch.as_tensor(scaled)),
@@ -187,6 +191,11 @@ class ConditionalImitationFlow:
         """The goal in each of them, shape (motions, d)."""
         return np.array(self._arrays["goals"])
 
+    @property
+    def calm_(self) -> Calmness | None:
+        """How calm the contexts that were fitted are together, as `ImitationFlow.calm_`."""
+        return self._trained.calm
+
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write a safetensors file whose header holds the settings as JSON; replace atomically."""
         if not hasattr(self, "_arrays"):
@@ -202,6 +211,8 @@ class ConditionalImitationFlow:
             for part in ("flow", "latent")
             for name, tensor in getattr(self._trained, part).state_dict().items()
         }
+        if self.calm_ is not None:
+            header["calm"] = self.calm_
         return write_model_file(path, header, {**self._arrays, **weights})
 
     @classmethod
@@ -217,11 +228,15 @@ class ConditionalImitationFlow:
             n_dims = header["n_dims"]
             if type(n_dims) is not int:
                 raise ValueError(f"expected n_dims to be a whole number, got {n_dims!r}")
-            model._restore(n_dims, arrays, restarts_of(header))
+            model._restore(n_dims, arrays, restarts_of(header), calmness_of(header))
         return model
 
     def _restore(
-        self, n_dims: int, arrays: dict[str, NDArray[Any]], restarts: list[Restart]
+        self,
+        n_dims: int,
+        arrays: dict[str, NDArray[Any]],
+        restarts: list[Restart],
+        calm: Calmness | None,
     ) -> None:
         weights = {k: arrays.pop(k) for k in list(arrays) if k.startswith(("flow.", "latent."))}
         n, k = arrays["contexts"].shape
@@ -255,7 +270,7 @@ class ConditionalImitationFlow:
                 if name.startswith(f"{part}.")
             }
             module.load_state_dict(named)
-        self._take(Trained(flow, latent, 0, restarts), arrays)
+        self._take(Trained(flow, latent, 0, restarts, calm), arrays)
         self.at(arrays["contexts"][0])  # checks all that Lemma 1 needs
 
     def _take(self, trained: Trained, arrays: dict[str, NDArray[Any]]) -> None:

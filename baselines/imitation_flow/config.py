@@ -29,7 +29,7 @@ class Resolved(NamedTuple):
 
 
 ENDS: Final = Resolved(
-    n_steps=4000,
+    n_steps=4500,
     sharpness=3.0,
     calm_weight=2.5,
     orbit_weight=0.0,
@@ -80,7 +80,7 @@ class ImitationFlowConfig:
     larger bends sharper corners and generalises less. None takes 3 where motions end and 1.5 where
     they repeat: recorded cycles are followed as well, and the field around them waves less."""
     n_steps: int | None = None
-    """Steps of Adam. None takes 4000 where motions end and 1500 where they repeat, which is one
+    """Steps of Adam. None takes 4500 where motions end and 1500 where they repeat, which is one
     stage instead of two."""
     likelihood_fraction: float = 0.1
     """Share of the steps that maximise the likelihood before the reproduction error is minimised

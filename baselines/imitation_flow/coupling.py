@@ -78,14 +78,8 @@ class CouplingFlow(Flow):
 
     def weights(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return R, hidden weights and output weights as `kernels` takes them."""
-        n_moved = self.n_dims - self.n_kept
-        hidden = torch.cat([self.hidden_weight, self.hidden_bias], dim=-1)
-        one = torch.zeros_like(hidden[..., :1, :])
-        one[..., -1] = SATURATED
-        factor = self.out_weight.new_ones(2 * n_moved, 1)
-        factor[:n_moved] = 1 / self.log_scale_bound
-        out = factor * torch.cat([self.out_weight, self.out_bias], dim=-1)
-        return self.orthogonal(), torch.cat([hidden, one], dim=-2), out
+        parts = self.hidden_weight, self.hidden_bias, self.out_weight, self.out_bias
+        return self.orthogonal(), *_Joined.apply(*parts, self.log_scale_bound)
 
     def forward(self, z: Tensor, context: Tensor | None = None, weights: Any = None) -> Tensor:
         """Return y = h(z), both (m, d, n)."""
@@ -118,6 +112,35 @@ class CouplingFlow(Flow):
         }
         arrays = {name: t.detach().double().cpu().numpy().copy() for name, t in tensors.items()}
         return {"rotation": self.rotations(model), **arrays}
+
+
+class _Joined(torch.autograd.Function):
+    """Weights with their biases, (layers, m, h + 1, seen + 1) and (layers, m, 2 moved, h + 1)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        hidden_weight: Tensor,
+        hidden_bias: Tensor,
+        out_weight: Tensor,
+        out_bias: Tensor,
+        bound: float,
+    ) -> tuple[Tensor, Tensor]:
+        lead, (n_hidden, n_seen) = hidden_weight.shape[:-2], hidden_weight.shape[-2:]
+        hidden = hidden_weight.new_zeros(*lead, n_hidden + 1, n_seen + 1)
+        hidden[..., :-1, :-1], hidden[..., :-1, -1:] = hidden_weight, hidden_bias
+        hidden[..., -1, -1] = SATURATED
+        out = torch.cat([out_weight, out_bias], dim=-1)
+        ctx.n_scales, ctx.bound = out.shape[-2] // 2, bound
+        out[..., : ctx.n_scales, :] /= bound
+        return hidden, out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_hidden: Tensor, g_out: Tensor) -> tuple[Tensor | None, ...]:
+        g_hidden, g_out = g_hidden[..., :-1, :], g_out.clone()
+        g_out[..., : ctx.n_scales, :] /= ctx.bound
+        return *(x for g in (g_hidden, g_out) for x in (g[..., :-1], g[..., -1:])), None
 
 
 class _Forward(torch.autograd.Function):

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 
 class Flow(nn.Module, ABC):
@@ -53,8 +54,8 @@ class Flow(nn.Module, ABC):
         """Return R of every layer, shape (layers, m, d, d)."""
         d = self.n_dims
         if d == 2:
-            cos, sin = torch.cos(self.angles[..., 0]), torch.sin(self.angles[..., 0])
-            return torch.stack([cos, sin, -sin, cos], dim=-1).unflatten(-1, (2, 2))
+            rotations: Tensor = _Rotations.apply(self.angles)
+            return rotations
         skew = self.angles.new_zeros(*self.angles.shape[:2], d, d)
         rows, columns = torch.triu_indices(d, d, 1)
         skew[..., columns, rows] = self.angles
@@ -82,3 +83,22 @@ class Flow(nn.Module, ABC):
         self, y: Tensor, context: Tensor | None = None, weights: Any = None
     ) -> tuple[Tensor, Tensor]:
         """Return z = h^-1(y), (m, d, n), and log |det dz/dy|, (m, n)."""
+
+
+class _Rotations(torch.autograd.Function):
+    """Rotations by angles (..., 1), shape (..., 2, 2), as one node."""
+
+    @staticmethod
+    def forward(ctx: Any, angles: Tensor) -> Tensor:
+        cos, sin = torch.cos(angles), torch.sin(angles)
+        rotations = torch.cat([cos, sin, -sin, cos], dim=-1)
+        ctx.save_for_backward(rotations)
+        return rotations.unflatten(-1, (2, 2))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> Tensor:
+        (rotations,) = ctx.saved_tensors
+        cos, sin = rotations[..., :1], rotations[..., 1:2]
+        first, above, below, last = g.flatten(-2).split(1, -1)
+        return (above - below) * cos - (first + last) * sin

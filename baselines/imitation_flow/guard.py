@@ -33,8 +33,14 @@ MOST_RESTARTS = 5
 WARM_UP = 0.15
 """Share of the steps in which the learning rate rises."""
 
-BETAS = (0.9, 0.99)
-"""Adam's decays; the first is cycled."""
+START, END = 1 / 25, 1e-4
+"""The rate's first value as a fraction of the peak, and its last as a fraction of the first."""
+
+MOMENTA = (0.85, 0.95)
+"""Adam's first decay at the peak of the rate, and at its ends."""
+
+BETA = 0.99
+"""Adam's second decay."""
 
 EPSILON = 1e-8
 """Adam's."""
@@ -68,21 +74,42 @@ def restarts_of(header: Mapping[str, Any]) -> list[Restart]:
 
 
 def one_cycle(peak: float, n_steps: int) -> list[tuple[float, float]]:
-    """Return the rate and Adam's first decay at each step: torch's one-cycle schedule, made once.
+    """Return the rate and Adam's first decay at each step: torch's one-cycle schedule.
 
-    The decay goes down while the rate goes up.
+    The rate rises along half a cosine from `START` of its peak, and falls along another to almost
+    nothing; the decay goes down while the rate goes up (Smith and Topin, "Super-convergence",
+    2019). Written out, since torch's takes an optimizer, whose making imports a second of compiler.
     """
-    optimizer = torch.optim.Adam([nn.Parameter(torch.zeros(1))], lr=peak, betas=BETAS)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, peak, total_steps=n_steps + 1, pct_start=WARM_UP
-    )
-    (group,) = optimizer.param_groups
+    rises, ends = WARM_UP * (n_steps + 1) - 1, float(n_steps)
     found = []
-    for _ in range(n_steps):
-        found.append((group["lr"], group["betas"][0]))
-        optimizer.step()
-        schedule.step()
+    for step in range(n_steps):
+        if step <= rises:
+            at, points = step / rises, ((START * peak, MOMENTA[1]), (peak, MOMENTA[0]))
+        else:
+            at = (step - rises) / (ends - rises)
+            points = ((peak, MOMENTA[0]), (START * END * peak, MOMENTA[1]))
+        share = (1 + math.cos(math.pi * at)) / 2
+        before, after = points
+        rate, decay = (y + share * (x - y) for x, y in zip(before, after, strict=True))
+        found.append((rate, decay))
     return found
+
+
+def adam_step(
+    parameters: Tensor,
+    gradient: Tensor,
+    moments: Sequence[Tensor],
+    n_taken: Tensor,
+    rate: float,
+    decay: float,
+) -> None:
+    """Take Adam's step in place, on contiguous arrays: torch's function without its optimizer."""
+    mean, square = moments
+    adam(
+        [parameters], [gradient], [mean], [square], [], [n_taken],
+        fused=True, amsgrad=False, maximize=False,
+        beta1=decay, beta2=BETA, lr=rate, weight_decay=0.0, eps=EPSILON,
+    )  # fmt: skip
 
 
 class GuardedAdam:
@@ -223,15 +250,9 @@ class GuardedAdam:
         )
 
     def _adam(self, gradient: Tensor) -> None:
-        """Take Adam's step: torch's function, without what its optimizer does around it."""
         rate, decay = self._cycle[self._taken]
         self._taken += 1
-        mean, square = self._moments
-        adam(
-            [self._flat.data], [gradient], [mean], [square], [], [self._n_taken],
-            fused=True, amsgrad=False, maximize=False,
-            beta1=decay, beta2=BETAS[1], lr=rate, weight_decay=0.0, eps=EPSILON,
-        )  # fmt: skip
+        adam_step(self._flat.data, gradient, self._moments, self._n_taken, rate, decay)
 
     def _state(self) -> list[Tensor]:
         """Return the parameters and Adam's moments."""

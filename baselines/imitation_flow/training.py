@@ -42,7 +42,12 @@ from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resol
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
-from iflow_gym.baselines.imitation_flow.guard import GuardedAdam, Restart, TrainingError
+from iflow_gym.baselines.imitation_flow.guard import (
+    GuardedAdam,
+    Restart,
+    TrainingError,
+    adam_step,
+)
 from iflow_gym.baselines.imitation_flow.inward import N_STATES, Inward
 from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
 from iflow_gym.baselines.imitation_flow.limit_cycle import LimitCycleLatent
@@ -91,6 +96,7 @@ NOISE_STEPS = 100
 NOISE_HORIZONS = 100
 NOISE_PAIRS = 20
 NOISE_RATE = 0.1
+NOISE_DECAY = 0.9
 
 
 @dataclass(frozen=True)
@@ -402,13 +408,15 @@ def _fit_noise(
     draws.new_step()
     latent.requires_grad_(False)
     latent.log_noise.requires_grad_(True)
-    optimizer = torch.optim.Adam([latent.log_noise], lr=NOISE_RATE)
     points, times = pairs_of(data, *random_pairs(data, draws, NOISE_HORIZONS, NOISE_PAIRS))
     with torch.no_grad():
         z = encode(flow, data, points).z.unflatten(-1, (2, NOISE_HORIZONS, NOISE_PAIRS))
     before, after = z.unbind(2)
+    # In memory of its own: a fused step takes arrays for contiguous, and this is a view of many.
+    noise = latent.log_noise
+    noise.data = noise.data.clone()
+    moments, n_taken = [torch.zeros_like(noise) for _ in range(2)], noise.new_zeros(())
     for _ in range(NOISE_STEPS):
         loss = -latent.transition_log_prob(before, after, times).mean((1, 2))
-        optimizer.zero_grad()
-        loss.sum().backward()
-        optimizer.step()
+        (gradient,) = torch.autograd.grad(loss.sum(), noise)
+        adam_step(noise.data, gradient, moments, n_taken, NOISE_RATE, NOISE_DECAY)

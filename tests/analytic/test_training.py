@@ -1,6 +1,8 @@
 """Training that goes wrong is noticed, taken back, recorded, and never returned as a fit."""
 
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -58,8 +60,10 @@ def test_a_bad_step_is_taken_back_and_leaves_the_other_models_alone(monkeypatch)
 
 
 def test_a_rate_that_is_far_too_high_is_lowered_until_training_holds():
-    """At a rate of 1 the loss of a curved motion explodes; the rate is halved until it holds."""
-    untrained, system = fit(n_steps=1)[0], fit(n_steps=300, learning_rate=1.0)[0]
+    """At a rate of 2 the loss of a curved motion explodes; the rate is halved until it holds."""
+    motion = load_lasa("Angle")
+    untrained = ImitationFlow(n_steps=1, **SMALL).fit(motion, seed=0)
+    system = ImitationFlow(n_steps=300, learning_rate=2.0, **SMALL).fit(motion, seed=0)
     halvings = range(1, len(system.restarts_) + 1)
     assert len(halvings) >= 1
     assert [r.rate for r in system.restarts_] == [0.5**k for k in halvings]
@@ -166,6 +170,35 @@ def test_a_file_of_several_motions_keeps_it_too(monkeypatch, tmp_path):
     again = ConditionalImitationFlow.load(model.save(tmp_path / "model"))
     assert len(model.at([1, 0]).restarts_) == 1
     assert again.at([1, 0]).restarts_ == model.at([1, 0]).restarts_
+    assert model.calm_ is not None
+    assert again.calm_ == model.calm_
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 7, 1500])
+def test_the_rates_are_those_of_torchs_one_cycle_schedule(n_steps):
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, 3e-3, total_steps=n_steps + 1, pct_start=guard.WARM_UP
+    )
+    (group,) = optimizer.param_groups
+    expected = []
+    for _ in range(n_steps):
+        expected.append((group["lr"], group["betas"][0]))
+        optimizer.step()
+        schedule.step()
+    np.testing.assert_allclose(guard.one_cycle(3e-3, n_steps), expected, rtol=1e-12)
+
+
+def test_fitting_imports_no_compiler():
+    """It takes a second, which is longer than many a fit here."""
+    code = (
+        "import sys; from iflow_gym import load_lasa; "
+        "from iflow_gym.baselines.imitation_flow import ImitationFlow; "
+        "ImitationFlow(n_steps=3).fit(load_lasa('Angle'), seed=0); "
+        "print('torch._dynamo' in sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "False"
 
 
 @pytest.mark.parametrize(
