@@ -48,7 +48,7 @@ class Train:
     stable: bool = False
     """Project the command so that the base's Lyapunov function falls."""
     rate_share: float | None = None
-    """Required rate of --stable, as a share of the base's slowest; a quarter by default."""
+    """Required rate of --stable, as a share of the base's slowest; 0.9 by default."""
     preset: str = "ppo"
     """ppo, sac, td3, or a path to a TOML file like theirs in baselines/presets/residual."""
     seed: int = 0
@@ -82,7 +82,7 @@ class Score:
     """Score a trained residual by the metrics of its environment."""
 
     run: Path
-    """Folder of the run."""
+    """Folder of the run, or the .safetensors file beside a record of the leaderboard."""
     env: str | None = None
     """Id to score on; an error if the residual was trained on another one."""
     seed: int = 0
@@ -184,10 +184,17 @@ def _score(options: Score, console: Console) -> int:
     from rich.table import Table
 
     from iflow_gym.baselines.residual_learning.artifacts import load_residual, read_card
+    from iflow_gym.baselines.residual_learning.recorded import load_recorded
     from iflow_gym.evaluate import evaluate
+    from iflow_gym.model_files import read_model_file
 
-    env = options.env or read_card(options.run).environment
-    policy = load_residual(options.run, environment=env)
+    if options.run.suffix == ".safetensors":
+        header, _ = read_model_file(options.run)
+        policy: Any = load_recorded(options.run)
+        env = options.env or header["card"]["environment"]
+    else:
+        env = options.env or read_card(options.run).environment
+        policy = load_residual(options.run, environment=env)
     found = evaluate(policy, gymnasium.make(env), seed=options.seed).metrics
     table = Table("metric", "value")
     for name, value in found.items():

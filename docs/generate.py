@@ -1,14 +1,16 @@
 """Writes the pages that are made of code: `python docs/generate.py`.
 
 docs/environments.md and a page for each family of environments from their docstrings,
-docs/metrics.md from the registry of metrics, the README's table of results from the committed
+docs/metrics.md from the registry of metrics, the tables of results in the README and on the page of
+residuals from the committed
 records. A test compares the pages with
 what this would write.
 """
 
 import inspect
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +28,7 @@ from iflow_gym.envs.drumming.recorded import DrummingRecordedEnv
 from iflow_gym.envs.lasa import LASAEnv
 from iflow_gym.envs.letters import LetterEnv, LetterRecordedEnv
 from iflow_gym.envs.point_mass import PointMassEnv
-from iflow_gym.metrics import METRICS
+from iflow_gym.metrics import METRICS, aggregate_scores
 from iflow_gym.registration import (
     DRUMMING_ID,
     DRUMMING_RECORDED_ID,
@@ -35,7 +37,7 @@ from iflow_gym.registration import (
     lasa_id,
     letter_id,
 )
-from iflow_gym.results import read_results
+from iflow_gym.results import Result, read_results
 
 DOCS = Path(__file__).parent
 
@@ -448,10 +450,90 @@ def readme() -> str:
     return f"{head}<!-- results -->\n{results()}\n<!-- /results -->{tail}"
 
 
+RESIDUALS = ("imitation-flow", "imitation-flow+residual", "imitation-flow+stable-residual", "ppo")
+"""Rows of the tables of residuals: the base, what is trained on it, learning from scratch."""
+
+Column = tuple[str, Callable[[Result], float | None]]
+
+OF_THE_PLANT: tuple[Column, ...] = (
+    ("reward a step", lambda r: r.returns["mean"]),
+    ("RMSE (mm)", lambda r: r.metrics["rmse"]),
+    ("Fréchet (mm)", lambda r: r.metrics["frechet"]),
+    ("DTW / sample (mm)", lambda r: r.metrics["dtw"]),
+    ("converged (%)", lambda r: percent(r.metrics["converged"])),
+    ("pushed, recovered (%)", lambda r: percent(r.metrics["perturbation_recovery"])),
+)
+OF_DRUMMING: tuple[Column, ...] = (
+    ("reward: hits", lambda r: r.returns["hits"]),
+    ("reward: progress", lambda r: r.returns["mean"]),
+    ("stroke off by (ms)", lambda r: 1000 * r.returns.get("stroke_error", math.nan)),
+    ("stroke's force (N)", lambda r: r.returns.get("stroke_force", math.nan)),
+    ("rhythm F1", lambda r: r.metrics["rhythm_f1"]),
+    ("hit F1", lambda r: r.metrics["hit_f1"]),
+    ("period off by (%)", lambda r: percent(r.metrics["period_error"])),
+    ("orbit distance (mm)", lambda r: 1000 * (r.metrics["orbit_distance"] or 0.0)),
+    ("attraction (%)", lambda r: percent(r.metrics["attraction"])),
+    ("pushed, recovered (%)", lambda r: percent(r.metrics["perturbation_recovery"])),
+)
+
+
+def percent(value: float | None) -> float | None:
+    """Return a share in per cent."""
+    return None if value is None else 100 * value
+
+
+def residual_table(records: Sequence[Result], columns: Sequence[Column]) -> str:
+    """Return a table of one environment: means over the seeds with 95 % bootstrap intervals."""
+    budget: tuple[Column, ...] = (
+        ("training (CPU s)", lambda r: r.fit["batch_cpu_seconds"] / r.fit["batch_size"]),
+        ("environment's share (%)", lambda r: percent(r.fit.get("environment_share"))),
+    )
+    titles = ["", "seeds", *(title for title, _ in (*columns, *budget))]
+    lines = [f"| {' | '.join(titles)} |", f"| --- | {' | '.join(['---:'] * (len(titles) - 1))} |"]
+    for method in RESIDUALS:
+        rows = sorted((r for r in records if r.method == method), key=lambda r: r.seed)
+        if not rows:
+            continue
+        cells = [rows[0].title, str(len(rows))]
+        for _, value in (*columns, *budget):
+            found = [value(r) for r in rows]
+            numbers = np.array([math.nan if v is None else v for v in found], dtype=np.float64)
+            cells.append(with_interval(numbers))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def with_interval(numbers: np.ndarray[Any, Any]) -> str:
+    """Return a mean over seeds and its 95 % interval; a dash where a seed has no value."""
+    if not np.isfinite(numbers).all():
+        return "-" if not np.isfinite(numbers).any() else "not in every seed"
+    if np.ptp(numbers) == 0:
+        return f"{numbers[0]:.3g}"
+    found = aggregate_scores(numbers[None])
+    low, high = found.mean_interval
+    return f"{found.mean:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def residual() -> str:
+    """Return the page of residuals with its tables of results filled in."""
+    path = DOCS / "residual.md"
+    head, rest = path.read_text().split("<!-- results -->")
+    _, tail = rest.split("<!-- /results -->")
+    records = read_results(DOCS.parent / "leaderboard" / "results")
+    rewarded = [r for r in records if r.method in RESIDUALS and r.ok and r.returns]
+    text = ""
+    for environment in sorted({r.environment for r in rewarded}):
+        here = [r for r in rewarded if r.environment == environment]
+        columns = OF_DRUMMING if "Drumming" in environment else OF_THE_PLANT
+        text += f"**`{environment}`**\n\n{residual_table(here, columns)}\n\n"
+    return f"{head}<!-- results -->\n{text.strip()}\n<!-- /results -->{tail}"
+
+
 PAGES = {
     "drumming.md": drumming,
     "environments.md": environments,
     "metrics.md": metrics,
+    "residual.md": residual,
     "../README.md": readme,
 } | {f"environments/{family.page}.md": partial(family_page, family) for family in FAMILIES}
 

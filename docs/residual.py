@@ -1,9 +1,8 @@
-"""Makes the picture of residuals: `python docs/residual.py`, four minutes.
+"""Makes the picture of residuals from the leaderboard's models: `python docs/residual.py`.
 
 docs/images/residual.png  under wind: the base, a residual, a stable residual
 """
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,7 @@ from matplotlib.figure import Figure
 
 import iflow_gym  # noqa: F401 (registers the environments)
 from iflow_gym.baselines.imitation_flow import ImitationFlow
-from iflow_gym.baselines.residual_learning.artifacts import load_residual
-from iflow_gym.baselines.residual_learning.settings import load_settings
-from iflow_gym.baselines.residual_learning.training import train
+from iflow_gym.baselines.residual_learning.recorded import load_recorded
 from iflow_gym.evaluation.rollouts import rollouts, rollouts_from_starts, scored_box
 from iflow_gym.figures import save_figure
 from iflow_gym.metrics import start_grid
@@ -27,32 +24,26 @@ from iflow_gym.plotting import (
     plot_goal,
     plot_rollouts,
 )
-from iflow_gym.residual.shield import RATE_SHARE
+from iflow_gym.results import result_path
 
 IMAGES = Path(__file__).parent / "images"
+RESULTS = Path(__file__).parents[1] / "leaderboard" / "results"
 ENVIRONMENT = "iflow/Disturbed-Sshape-v0"
 STARTS_PER_AXIS = 6
 ARROWS = 11
 
 
-def policies(task: Any) -> dict[str, Any]:
-    """Return the base and what was trained on it."""
-    base = ImitationFlow().fit(task.demonstrations, seed=0)
-    found: dict[str, Any] = {"ImitationFlow": base}
-    with tempfile.TemporaryDirectory() as folder:
-        model = base.save(Path(folder) / "base.safetensors")
-        for title, stable in (("+ residual", None), ("+ stable residual", RATE_SHARE)):
-            place = Path(folder) / title
-            train(
-                place,
-                ENVIRONMENT,
-                load_settings("ppo"),
-                0,
-                base=("imitation-flow", model),
-                stable=stable,
-                tensorboard=False,
-            )
-            found[title] = load_residual(place)
+def policies() -> dict[str, Any]:
+    """Return the base and what was trained on it: the leaderboard's, of seed 0."""
+    found: dict[str, Any] = {}
+    for title, row in (
+        ("ImitationFlow", "imitation-flow"),
+        ("+ residual", "imitation-flow+residual"),
+        ("+ stable residual", "imitation-flow+stable-residual"),
+    ):
+        path = result_path(row, ENVIRONMENT, "reproduction", 0).with_suffix(".safetensors")
+        load = ImitationFlow.load if row == "imitation-flow" else load_recorded
+        found[title] = load(RESULTS / path)
     return found
 
 
@@ -81,13 +72,13 @@ def draw(task: Any, found: dict[str, Any]) -> Figure:
 
 
 def _wind(ax: Any, task: Any) -> None:
-    """Draw the wind's force as arrows over the axes."""
+    """Draw the wind's force on a mass at rest as arrows over the axes."""
     across, up = (np.linspace(*ends, ARROWS + 2)[1:-1] for ends in (ax.get_xlim(), ax.get_ylim()))
     points = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
-    force = task.wind_force(points)
+    force = task.wind_force(points, np.zeros_like(points))
     ax.quiver(*points.T, *force.T, color="#b9b3a6", width=0.004, zorder=0.5)
 
 
 if __name__ == "__main__":
     unwrapped = gymnasium.make(ENVIRONMENT).unwrapped
-    save_figure(draw(unwrapped, policies(unwrapped)), IMAGES / "residual.png")
+    save_figure(draw(unwrapped, policies()), IMAGES / "residual.png")

@@ -83,7 +83,9 @@ class Result:
     it is to be told apart from, by environment id; empty where there are none."""
     returns: dict[str, float] = field(default_factory=dict)
     """Rewards a step of an episode from each recording's start, by the environment's own reward:
-    `mean`, `least` and `greatest` over the recordings; empty where none was asked for."""
+    `mean`, `least` and `greatest` over the recordings; of drumming also what
+    `iflow_gym.envs.hit_reward` pays (`hits`), and of the strokes `stroke_force`, N, and
+    `stroke_error`, s. Empty where none was asked for."""
     guarantee: Guarantee | None = None
     """What the method says of its stability; None for a failed cell and for a reference."""
     target: str | None = None

@@ -136,7 +136,8 @@ def test_v_falls_at_every_step_for_every_agent(kind, data, request):
     assert np.abs(c + kept).max() <= task.max_speed
     before, after = lyapunov.value(x), lyapunov.value(x + dt[:, None] * (c + kept))
     as_base = (kept == 0).all(axis=1)
-    assert (after[~as_base] <= (np.exp(-shield.rate * dt) * before)[~as_base] * (1 + 1e-12)).all()
+    bound = np.maximum(np.exp(-shield.rate * dt) * before, lyapunov.floor)
+    assert (after[~as_base] <= bound[~as_base] * (1 + 1e-12)).all()
     assert (after[as_base] < before[as_base]).all()
     assert (~as_base).mean() > 0.3
 
@@ -148,7 +149,8 @@ def test_v_falls_along_the_environment_under_the_worst_agent(kind, request):
     env_id = "iflow/LASA-Angle-v0" if kind == "angle" else "iflow/Letter-O-v0"
     envs = gymnasium.make_vec(env_id, num_envs=32, vectorization_mode="vector_entry_point")
     wrapped = ResidualActionWrapper(envs, system, scale=1.0, stable=0.5)
-    hostile = Hostile(wrapped.composition, FlowLyapunov(system))
+    lyapunov = FlowLyapunov(system)
+    hostile = Hostile(wrapped.composition, lyapunov)
     demos = envs.unwrapped.demonstrations
     rng = np.random.default_rng(3)
     box = demos.bounding_box
@@ -161,7 +163,7 @@ def test_v_falls_along_the_environment_under_the_worst_agent(kind, request):
         x = np.stack(envs.unwrapped._state, axis=-1)
         _, _, _, _, info = wrapped.step(hostile.at(x))
         after = system.lyapunov(np.stack(envs.unwrapped._state, axis=-1))
-        bound = np.exp(-rate * info["dt"]) * value
+        bound = np.maximum(np.exp(-rate * info["dt"]) * value, lyapunov.floor)
         as_base = (info["command"] == info["base_command"]).all(axis=1)
         assert (after <= np.where(as_base, value, bound) * (1 + 1e-9) + floor).all()
         value = after
@@ -197,12 +199,43 @@ def test_round_a_cycle_only_what_leads_away_is_taken_off(letter):
     _, gradient = lyapunov.value_and_gradient(x)
     along = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1)
     along *= 0.1 * task.max_speed / np.linalg.norm(along, axis=1, keepdims=True)
-    off = lyapunov.value(x) > 1e-3
-    assert off.sum() > 5
-    np.testing.assert_allclose(shield.kept(x, c, along, dt)[off], along[off], rtol=1e-6)
+    np.testing.assert_allclose(shield.kept(x, c, along, dt), along, rtol=1e-6)
     outward = 0.1 * task.max_speed * gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     kept = shield.kept(x, c, along + outward, dt)
-    assert ((kept * gradient).sum(axis=1) < (outward * gradient).sum(axis=1)).all()
+    off = lyapunov.value(x) > lyapunov.floor
+    assert off.sum() > 5
+    assert ((kept * gradient).sum(axis=1) < (outward * gradient).sum(axis=1))[off].all()
+
+
+def test_on_the_cycle_the_tempo_is_the_agents_at_the_environments_dt(letter):
+    """Faster and slower round the orbit from the orbit itself, and never out of the tube."""
+    lyapunov = FlowLyapunov(letter)
+    envs = gymnasium.make_vec("iflow/Letter-O-v0", 8, "vector_entry_point", horizon=1000)
+    on_it = letter.rollout(load_letter("O").positions[0][0], 4000, 0.01)[-1]
+    way = {}
+    for faster in (-0.5, 0.0, 0.5):
+        wrapped = ResidualActionWrapper(envs, letter, scale=0.2, stable=True)
+        _, info = wrapped.reset(seed=0, options={"start": on_it})
+        base, angles = info["base_command"], [_angle(letter, on_it)]
+        for _ in range(20):
+            action = faster * base / (0.2 * envs.unwrapped.max_speed)
+            _, _, _, _, info = wrapped.step(action)
+            x = np.stack(envs.unwrapped._state, axis=-1)
+            assert lyapunov.value(x).max() <= lyapunov.floor * (1 + 1e-9)
+            angles.append(_angle(letter, x[0]))
+            base = wrapped._command
+        # Steps are far shorter than half a round, and so are told from what is beyond it.
+        way[faster] = float(np.unwrap(angles)[-1] - angles[0])
+    expected = 2 * np.pi * 20 * float(info["dt"][0]) / letter.period_
+    assert abs(way[0.0]) == pytest.approx(expected, rel=0.02)
+    assert 0.4 < way[-0.5] / way[0.0] < 0.6
+    assert way[0.5] / way[0.0] > 1.2
+
+
+def _angle(system, x):
+    """Return the angle of a state round the latent cycle, in radians."""
+    z = system._encode(x[None])[0][0]
+    return np.arctan2(z[1], z[0])
 
 
 def test_bad_arguments_say_what_was_expected(angle):

@@ -15,17 +15,19 @@ from rich.console import Console
 
 from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.model_files import ModelFileError
 from iflow_gym.residual import ResidualVectorWrapper
 from iflow_gym.residual.policy import Zero
 
 pytest.importorskip("stable_baselines3")
 
-from iflow_gym.baselines.residual_learning import records, training
+from iflow_gym.baselines.residual_learning import recorded, records, training
 from iflow_gym.baselines.residual_learning.agents import AgentFileError
 from iflow_gym.baselines.residual_learning.artifacts import (
     AGENT,
     BASE,
     CARD,
+    LAST,
     load_residual,
     read_card,
 )
@@ -51,7 +53,8 @@ def _short_evaluations(monkeypatch, request):
     """Evaluations on the way take thousands of steps: what they measure has a test of its own."""
     if "returns" not in request.node.name:
         monkeypatch.setattr(training, "returns_of", lambda *_: np.full(7, 0.5))
-        monkeypatch.setattr(records, "returns_of", lambda *_: np.linspace(0.1, 0.7, 7))
+        spread = {"mean": 0.4, "least": 0.1, "greatest": 0.7}
+        monkeypatch.setattr(records, "performance", lambda *_: dict(spread))
 
 
 @pytest.fixture(scope="module")
@@ -193,17 +196,15 @@ def test_a_run_leaves_checkpoints_curves_and_evaluations(trained, model):
     assert curve[-1]["steps"] == card.steps
 
 
-def test_the_same_seed_gives_the_same_agent(trained, model, tmp_path):
-    base = ("imitation-flow", model)
-    train(tmp_path / "a", ENV, few(), 0, base=base, stable=0.25, tensorboard=False)
-    train(tmp_path / "b", ENV, few(), 1, base=base, stable=0.25, tensorboard=False)
-    features = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
-    one, same, other = (
-        load_residual(folder).agent.predict(features, deterministic=True)[0]
-        for folder in (trained, tmp_path / "a", tmp_path / "b")
-    )
-    np.testing.assert_array_equal(one, same)
-    assert (one != other).any()
+def test_the_same_seed_gives_the_same_agent(model, tmp_path):
+    base, features = ("imitation-flow", model), np.random.default_rng(0).normal(size=(5, 8))
+    found = []
+    for name, seed in (("one", 0), ("same", 0), ("other", 1)):
+        train(tmp_path / name, ENV, few(), seed, base=base, stable=0.25, tensorboard=False)
+        agent = load_residual(tmp_path / name).agent
+        found.append(agent.predict(features.astype(np.float32), deterministic=True)[0])
+    np.testing.assert_array_equal(found[0], found[1])
+    assert (found[0] != found[2]).any()
 
 
 def test_a_run_is_resumed_where_it_was(trained, tmp_path):
@@ -221,16 +222,35 @@ def test_a_run_is_resumed_where_it_was(trained, tmp_path):
     assert curve[0] < before < curve[-1] == 256
     # An interrupted run has no agent yet: its last checkpoint is taken.
     (folder / AGENT).unlink()
+    (folder / LAST).unlink()
     for later in (folder / "checkpoints").glob("agent_*_steps.zip"):
         if int(later.stem.split("_")[1]) > 64:
             later.unlink()
     assert resume(folder, total_steps=192).card.steps == 192
 
 
+def test_the_agent_of_the_best_evaluation_is_kept(model, tmp_path, monkeypatch):
+    """The means come in this order; ties go to the later one."""
+    means, seen = iter([0.2, 0.7, 0.7, 0.3]), []
+
+    def evaluated(agent, *_):
+        seen.append([p.detach().clone() for p in agent.policy.parameters()])
+        return np.full(7, next(means))
+
+    monkeypatch.setattr(training, "returns_of", evaluated)
+    settings = few(total_steps=192, n_evaluations=3)
+    train(tmp_path, ENV, settings, 0, base=("imitation-flow", model), tensorboard=False)
+    kept = list(load_residual(tmp_path).agent.policy.parameters())
+    assert len(seen) == 4
+    assert all((ours == theirs).all() for ours, theirs in zip(kept, seen[2], strict=True))
+    assert any((ours != theirs).any() for ours, theirs in zip(kept, seen[1], strict=True))
+
+
 def test_resuming_keeps_what_was_learned(trained, tmp_path, monkeypatch):
     """The optimizer goes on too: a step from there is not a first step of Adam."""
     folder = tmp_path / "copy"
     shutil.copytree(trained, folder)
+    shutil.copyfile(folder / LAST, folder / AGENT)  # in place of the best one
     before = load_residual(folder).agent
     kept = {}
     original = training.set_parameters
@@ -317,9 +337,9 @@ def test_returns_are_of_the_recordings_own_episodes(model):
 
 
 def test_presets_and_settings_say_what_is_wrong(tmp_path):
-    assert set(known_presets()) == set(ALGORITHMS)
+    assert set(known_presets()) == {*ALGORITHMS, "drumming"}
     assert load_settings("ppo", total_steps=7, scale=None).total_steps == 7
-    with pytest.raises(SettingsError, match="ppo, sac, td3 or a path"):
+    with pytest.raises(SettingsError, match="drumming, ppo, sac, td3 or a path"):
         load_settings("dqn")
     path = tmp_path / "own.toml"
     path.write_text('[training]\nalgorithm = "ppo"\nsteps = 3\n')
@@ -363,12 +383,24 @@ def test_rows_become_records_on_the_bases_of_the_leaderboard(model, tmp_path, mo
     assert "measured, not proved" in record.guarantee.reason
     assert record.returns["least"] <= record.returns["mean"] <= record.returns["greatest"]
     folder = tmp_path / "imitation-flow+stable-residual"
-    assert (folder / "Disturbed-Angle-v0.reproduction.seed0.zip").is_file()
+    file = folder / str(record.model)
+    assert file.stat().st_size < 60_000
+    policy = recorded.load_recorded(file)
+    assert isinstance(policy.base_policy, ImitationFlow)
+    assert policy.stable == row.stable
+    with pytest.raises(FileNotFoundError, match="Expected the base of"):
+        recorded.load_recorded(file, tmp_path / "absent.safetensors")
+    with pytest.raises(AgentFileError, match="corrections belong to that base alone"):
+        recorded.load_recorded(file, file)
+    with pytest.raises(ModelFileError, match="no whole 'imitation-flow' model"):
+        recorded.load_recorded(model)
     monkeypatch.setattr(records, "train", None)
     assert records.make_record(tmp_path, row, ENV, 0, few()) == record
     with pytest.raises(TypeError):
         records.make_record(tmp_path, row, ENV, 0, few(scale=0.2))
-    kinds = {r.name: r.guarantee(True).kind for r in records.rows("ppo").values()}
+    assert "tube" not in record.guarantee.reason
+    assert "a tube of 2% of" in row.guarantee(False, True).reason
+    kinds = {r.name: r.guarantee(True, False).kind for r in records.rows("ppo").values()}
     assert kinds == {
         "imitation-flow+residual": "none",
         "imitation-flow+stable-residual": "proved",
@@ -399,7 +431,7 @@ def test_the_command_line_trains_resumes_scores_and_says_what_it_misses(
     assert residual.run(command, console) == 0
     assert "64 steps in" in text.getvalue()
     assert "in the environment and the base" in text.getvalue()
-    assert read_card(folder).stable == 0.25
+    assert read_card(folder).stable == 0.9
     assert residual.run(residual.Resume(folder, total_steps=128, progress=False), console) == 0
     assert read_card(folder).steps == 128
     assert residual.run(residual.Score(folder), console) == 0

@@ -16,6 +16,9 @@ from iflow_gym.baselines.imitation_flow.fields.latents import CycleField, Latent
 from iflow_gym.baselines.imitation_flow.model import ImitationFlow
 from iflow_gym.demonstrations import FloatArray
 
+TUBE = 0.02
+"""Round a cycle V may rise up to the level at this distance, in its latent radius."""
+
 
 class FlowLyapunov:
     """V of a fitted system, and its gradient: a `iflow_gym.residual.LyapunovFunction`.
@@ -34,6 +37,10 @@ class FlowLyapunov:
         self._frame = np.asarray(dynamics.frame, dtype=np.float64)
         self.decay = 2.0 * latent.min_decay / dynamics.time
         """dV/dt <= -decay V along the mean dynamics, in 1/s."""
+        self.floor = 0.0
+        """V at the border of the tube round a cycle; 0 for a motion that ends."""
+        if isinstance(latent, CycleField):
+            self.floor = (TUBE * latent.radius) ** 2
 
     def value(self, x: FloatArray) -> FloatArray:
         """Return V(x), shape (n,), of states x, shape (n, d)."""

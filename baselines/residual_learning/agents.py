@@ -60,7 +60,7 @@ def read_agent(
     AgentFileError
         If the file is no agent of these settings and spaces.
     """
-    env = _spaces_only(observation_space, action_space, settings.num_envs)
+    env = spaces_only(observation_space, action_space, settings.num_envs)
     agent = make_agent(settings, env, 0, None)
     set_parameters(agent, path)
     return agent
@@ -85,7 +85,7 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _spaces_only(observation_space: Any, action_space: Any, num_envs: int) -> Any:
+def spaces_only(observation_space: Any, action_space: Any, num_envs: int) -> Any:
     """Return environments that have spaces and are never stepped."""
     from stable_baselines3.common.vec_env import DummyVecEnv
 

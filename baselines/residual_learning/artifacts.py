@@ -27,7 +27,7 @@ from iflow_gym.residual.composition import Composition
 from iflow_gym.residual.policy import ResidualPolicy
 from iflow_gym.system import DynamicalSystem
 
-AGENT, BASE, CARD = "agent.zip", "base.safetensors", "card.json"
+AGENT, LAST, BASE, CARD = "agent.zip", "last.zip", "base.safetensors", "card.json"
 CARD_VERSION = 1
 
 

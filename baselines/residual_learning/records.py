@@ -11,7 +11,6 @@ import dataclasses
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,10 +18,12 @@ from typing import Any
 
 import gymnasium
 
+from iflow_gym.baselines.imitation_flow.lyapunov import TUBE
 from iflow_gym.baselines.registry import load_method
-from iflow_gym.baselines.residual_learning.artifacts import AGENT, CARD, load_residual
+from iflow_gym.baselines.residual_learning.artifacts import load_residual, settings_of
+from iflow_gym.baselines.residual_learning.recorded import write_recorded
 from iflow_gym.baselines.residual_learning.settings import TrainingSettings
-from iflow_gym.baselines.residual_learning.tasks import returns_of
+from iflow_gym.baselines.residual_learning.tasks import performance
 from iflow_gym.baselines.residual_learning.training import Trained, train
 from iflow_gym.baselines.runner.fingerprint import (
     CORE_LIBRARIES,
@@ -36,7 +37,7 @@ from iflow_gym.baselines.runner.fingerprint import (
 from iflow_gym.baselines.runner.plan import entry_points, family
 from iflow_gym.evaluate import evaluate, motion_of
 from iflow_gym.metrics import metrics_hash, metrics_of
-from iflow_gym.residual.policy import Zero
+from iflow_gym.residual.policy import ResidualPolicy, Zero
 from iflow_gym.residual.shield import RATE_SHARE
 from iflow_gym.results import Result, check_metrics, read_result, result_path, write_result
 from iflow_gym.system import Guarantee
@@ -50,6 +51,9 @@ PROTOCOL = "reproduction"
 MODULE = "iflow_gym.baselines.residual_learning.training"
 """Module whose code, and what it imports, decides what is learned."""
 
+REWARDS = ("iflow_gym.envs.guide", "iflow_gym.envs.hit_reward")
+"""Modules of rewards: no part of what scores a method, but of what these learn from."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -62,7 +66,7 @@ class Row:
     scratch: bool = False
     """Whether there is no base."""
 
-    def guarantee(self, velocity_mode: bool) -> Guarantee:
+    def guarantee(self, velocity_mode: bool, cyclic: bool) -> Guarantee:
         """Return what is known about its stability."""
         if self.stable is None:
             what = "nothing is under the agent" if self.scratch else "the agent may oppose the base"
@@ -72,11 +76,18 @@ class Row:
             if velocity_mode
             else "How closely the plant follows its command is measured, not proved."
         )
+        falls = (
+            f"V(x + dt u) <= exp(-rho dt) V(x) with rho {self.stable:g} of the base's slowest rate"
+        )
+        if cyclic:
+            falls = (
+                f"outside a tube of {TUBE:.0%} of the latent radius round the cycle {falls}; "
+                "inside V stays below the tube's level"
+            )
         return Guarantee(
             "proved",
-            "Of the commanded velocity u: V of the base falls at every step, V(x + dt u) <= "
-            f"exp(-rho dt) V(x) with rho {self.stable:g} of the base's slowest rate, or as the "
-            f"base alone, whatever the agent wants. {plant}",
+            f"Of the commanded velocity u, V the base's squared latent distance: {falls}; or u is "
+            f"the base's own, whatever the agent wants. {plant}",
         )
 
 
@@ -113,8 +124,8 @@ def with_returns(folder: Path, environment: str, seed: int) -> Result:
     if record.returns:
         return record
     system: Any = load_method(BASE).load(model)
-    found = returns_of(Zero(system.n_dims_), environment, system, 1.0, False)
-    record = dataclasses.replace(record, returns=_statistics(found))
+    found = performance(Zero(system.n_dims_), environment, system, 1.0, False)
+    record = dataclasses.replace(record, returns=found)
     write_result(folder, record)
     return record
 
@@ -132,8 +143,8 @@ def make_record(
 ) -> Result:
     """Train and score a row on an environment, and write its record and what was trained.
 
-    Beside the record lie the agent, ``.zip``, and its card, ``.card.json``; `runs` keeps the whole
-    folder of the training, its curves and checkpoints.
+    Beside the record lies the agent (`recorded`), whose base is the model beside the record of the
+    base; `runs` keeps the whole folder of the training, its curves and checkpoints.
     """
     task: Any = gymnasium.make(environment).unwrapped
     base, model = base_record(folder, environment, seed)
@@ -156,10 +167,10 @@ def make_record(
             progress=progress,
             tensorboard=runs is not None,
         )
-        record = _scored(row, environment, task, seed, trained, hashes, used, key)
+        policy = load_residual(place)
+        record = _scored(policy, row, environment, task, seed, trained, hashes, used, key)
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(place / AGENT, target.with_suffix(".zip"))
-        shutil.copyfile(place / CARD, target.with_suffix(".card.json"))
+        write_recorded(target.with_suffix(".safetensors"), row.name, policy, trained.card)
     write_result(folder, record)
     return record
 
@@ -175,11 +186,11 @@ def _identity(
     """Return hashes of what decides the scores, the libraries' versions, and the key of both."""
     motion = motion_of(task)
     code = method_code(MODULE)
-    config = {**settings.as_json(), "stable": row.stable, "base": None if row.scratch else BASE}
+    config = _config(row, settings)
     hashes = {
         "data": task.demonstrations.sha256,
         "metrics": metrics_hash(motion),
-        "code": code.sha256,
+        "code": sha256_of([code.sha256, *(method_code(name).sha256 for name in REWARDS)]),
         "core": core_hash(entry_points(environment), motion),
         "config": sha256_of(config),
     }
@@ -191,7 +202,12 @@ def _identity(
     return hashes, used, sha256_of(decisive)
 
 
+def _config(row: Row, settings: TrainingSettings) -> dict[str, Any]:
+    return {**settings.as_json(), "stable": row.stable, "base": None if row.scratch else BASE}
+
+
 def _scored(
+    policy: ResidualPolicy,
     row: Row,
     environment: str,
     task: Any,
@@ -201,12 +217,12 @@ def _scored(
     used: dict[str, str],
     key: str,
 ) -> Result:
-    policy = load_residual(trained.folder)
     card = trained.card
+    place = result_path(row.name, environment, PROTOCOL, seed)
     began = time.perf_counter()
     found = evaluate(policy, task, seed=seed, protocol=PROTOCOL)
     seconds = time.perf_counter() - began
-    returns = returns_of(policy.agent, environment, policy.base_policy, card.scale, card.shield)
+    returns = performance(policy.agent, environment, policy.base_policy, card.scale, card.shield)
     values = found.metrics | {
         "fit_seconds": trained.wall_seconds,
         "fit_cpu_seconds": trained.cpu_seconds,
@@ -230,10 +246,11 @@ def _scored(
         metrics=metrics,
         medians=found.medians,
         per_demonstration=found.per_demonstration,
-        returns=_statistics(returns),
-        guarantee=row.guarantee(exact),
-        target="iflow_gym.baselines.residual_learning.artifacts:load_residual",
-        config={**card.settings, "stable": row.stable, "base": card.base},
+        returns=returns,
+        guarantee=row.guarantee(exact, task.demonstrations.period is not None),
+        target="iflow_gym.baselines.residual_learning.recorded:load_recorded",
+        config=_config(row, settings_of(card)),
+        model=place.with_suffix(".safetensors").name,
         integrator="its base's command and the agent's",
         dt=task.demonstrations.mean_dt,
         fit={
@@ -248,12 +265,3 @@ def _scored(
         versions=used,
         hardware=hardware(1),
     )
-
-
-def _statistics(returns: Any) -> dict[str, float]:
-    values: Sequence[float] = [float(v) for v in returns]
-    return {
-        "mean": sum(values) / len(values),
-        "least": min(values),
-        "greatest": max(values),
-    }

@@ -15,6 +15,9 @@ FOLDER = Path(__file__).parents[1] / "presets" / "residual"
 Algorithm = Literal["ppo", "sac", "td3"]
 ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)
 
+Reward = Literal["environment", "hits"]
+REWARDS: tuple[Reward, ...] = get_args(Reward)
+
 
 class SettingsError(ValueError):
     """A preset or a setting is not understood."""
@@ -34,6 +37,9 @@ class TrainingSettings:
     """Largest residual in greatest speeds."""
     scratch_scale: float = 0.4
     """The same where there is no base: twice the peak speed of recordings in the plane."""
+    reward: Reward = "environment"
+    """What is learned from: the environment's own reward, or for drumming "hits", that of
+    `iflow_gym.envs.hit_reward.HitReward`."""
     reward_scale: float = 1.0
     """What rewards are multiplied by for the agent. With 1 - gamma the values that it learns are of
     order 1, and do not drown the policy's gradient where both are clipped together."""
@@ -45,8 +51,8 @@ class TrainingSettings:
     that noise alone carries inward; what an agent leaves to it is missing when it acts without."""
     action_noise: float = 0.0
     """Standard deviation of the noise of TD3's exploration, in largest residuals."""
-    n_evaluations: int = 10
-    """How often the agent is evaluated, evenly, on all recordings' starts."""
+    n_evaluations: int = 20
+    """How often the agent is evaluated, evenly, on all recordings' starts; the best one is kept."""
     n_checkpoints: int = 4
     """How often the agent is kept as a checkpoint, evenly."""
     keywords: dict[str, Any] = field(default_factory=dict)
@@ -59,6 +65,8 @@ class TrainingSettings:
             raise SettingsError(
                 f"Expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}."
             )
+        if self.reward not in REWARDS:
+            raise SettingsError(f"Expected a reward of {', '.join(REWARDS)}, got {self.reward!r}.")
         for name in ("total_steps", "num_envs", "n_evaluations", "n_checkpoints"):
             if not (isinstance(value := getattr(self, name), int) and value >= 1):
                 raise SettingsError(f"Expected {name} >= 1, a whole number, got {value!r}.")

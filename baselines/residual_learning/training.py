@@ -22,6 +22,7 @@ from iflow_gym.baselines.residual_learning.agents import (
 from iflow_gym.baselines.residual_learning.artifacts import (
     AGENT,
     BASE,
+    LAST,
     Card,
     load_base,
     read_card,
@@ -138,8 +139,8 @@ def resume(
 def _latest(folder: Path, card: Card) -> tuple[Path, int]:
     """Return the agent with the most steps in a folder, and how many they are."""
     found = [(path, _steps(path)) for path in (folder / "checkpoints").glob("agent_*_steps.zip")]
-    if (folder / AGENT).is_file():
-        found.append((folder / AGENT, card.steps))
+    if (folder / LAST).is_file():
+        found.append((folder / LAST, card.steps))
     if not found:
         raise FileNotFoundError(f"Expected an agent or a checkpoint in {folder}, got none.")
     return max(found, key=lambda entry: entry[1])
@@ -167,6 +168,7 @@ def _learn(
         card.scale,
         card.shield,
         settings.reward_scale,
+        settings.reward,
     )
     curves = folder / "tensorboard" if tensorboard else None
     agent = make_agent(settings, env, card.seed + card.steps, curves)
@@ -200,7 +202,7 @@ def _learn(
     )
     evaluate.run()
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-    agent.save(folder / AGENT)
+    agent.save(folder / LAST)
     card = dataclasses.replace(card, steps=int(agent.num_timesteps))
     write_card(folder, card)
     env.close()
@@ -208,16 +210,16 @@ def _learn(
 
 
 class EvaluateCallback(BaseCallback):
-    """Measures the mean reward a step from every recording's start, now and then.
+    """Measures the mean reward a step from every recording's start, and keeps the best agent.
 
-    `evaluations.json` has a line for each: steps and the mean over the recordings.
+    `evaluations.json` has a line for each: steps and the mean over the recordings. The agent of the
+    greatest mean is the run's: what exploration learns is not always better without its noise.
     """
 
     def __init__(self, folder: Path, card: Card, base: Any, every: int, *, keep: bool) -> None:
         super().__init__()
-        self._path, self._card, self._base, self._every = (
-            folder / "evaluations.json", card, base, every
-        )  # fmt: skip
+        self._folder, self._path = folder, folder / "evaluations.json"
+        self._card, self._base, self._every = card, base, every
         self._next = card.steps
         self.found: list[dict[str, float]] = []
         if keep and self._path.is_file():
@@ -234,9 +236,18 @@ class EvaluateCallback(BaseCallback):
         """Evaluate now."""
         card = self._card
         assert self.model is not None
-        returns = returns_of(self.model, card.environment, self._base, card.scale, card.shield)
+        returns = returns_of(
+            self.model,
+            card.environment,
+            self._base,
+            card.scale,
+            card.shield,
+            settings_of(card).reward,
+        )
         mean = float(returns.mean())
         self.found.append({"steps": int(self.model.num_timesteps), "mean_reward": mean})
+        if mean >= max(entry["mean_reward"] for entry in self.found):
+            self.model.save(self._folder / AGENT)
         self._path.write_text(json.dumps(self.found, indent=1) + "\n", encoding="utf-8")
         self.logger.record("eval/mean_reward_a_step", mean)
 

@@ -19,7 +19,7 @@ LONGEST = {"name": 60, "title": 60}
 LONGEST_TEXT = 1000
 """Most characters of a value, where `LONGEST` has no other number."""
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 _ADDRESS = re.compile(r"https://[^\s<>\"'`|]+")
 
 

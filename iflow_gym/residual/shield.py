@@ -43,6 +43,11 @@ no error of grad V can break it; both only decide how much of r is kept. What is
 the segment from c to c + r*, along which V is found by the chord: exact as a bound where V is
 convex along the segment, which it is at the length of a step, and tried again where it is not.
 
+**A tube round a cycle.** On the cycle V = 0 may not rise at all, and a straight step that is longer
+than the base's leaves a curved orbit: nothing could be added. There V may rise up to a level V_0,
+`LyapunovFunction.floor`: with max(exp(-rho dt) V, V_0) for exp(-rho dt) V above, V falls to V_0 as
+it did to 0, and stays below it. For motions that end V_0 = 0.
+
 **What is assumed.** That the state is carried to x + dt u: by the point mass in velocity mode, up
 to rounding, as long as u is within its speed limit (r is shortened for that, too) and no wall is
 touched. A mass that must be pushed, or an arm, follows its command with an error e: then V is
@@ -59,8 +64,9 @@ import numpy as np
 
 from iflow_gym.demonstrations import FloatArray
 
-RATE_SHARE = 0.25
-"""Default of the required rate, as a share of the base's own slowest."""
+RATE_SHARE = 0.9
+"""Default of the required rate, as a share of the base's own slowest. A smaller one lets the agent
+come to rest later; all of it leaves no room where the base itself falls at just that rate."""
 
 CHORDS = 4
 """How often what is added is shortened before the base's own command is taken."""
@@ -75,6 +81,10 @@ class LyapunovFunction(Protocol):
     @property
     def decay(self) -> float:
         """The rate in 1/s with dV/dt <= -decay V along the base's own field."""
+
+    @property
+    def floor(self) -> float:
+        """The level of V up to which it may rise, >= 0: 0 for a motion that ends."""
 
     def value(self, x: FloatArray) -> FloatArray:
         """Return V(x) >= 0, shape (n,)."""
@@ -127,9 +137,11 @@ class LyapunovShield:
             Seconds that the command will be held.
         """
         level, gradient = self.lyapunov.value_and_gradient(x)
-        kept = projected(command, added, gradient, -self.rate * level)
+        floor = self.lyapunov.floor
+        slope = np.maximum(-self.rate * level, (floor - level) / dt)
+        kept = projected(command, added, gradient, slope)
         kept = within_speed(command, kept, self.max_speed)
-        bound = np.exp(-self.rate * dt) * level
+        bound = np.maximum(np.exp(-self.rate * dt) * level, floor)
         return self._shortened(x, command, kept, dt, bound)
 
     def _shortened(

@@ -46,7 +46,7 @@ class ResidualActionWrapper(
     stable : bool or float
         Whether the command is projected so that the base's Lyapunov function falls whatever the
         agent does (`iflow_gym.residual.shield` has what is proved); a number in (0, 1] is the
-        required rate as a share of the base's slowest, True takes a quarter.
+        required rate as a share of the base's slowest, True takes 0.9.
 
     Examples
     --------
