@@ -32,11 +32,12 @@ def load(path):
     return module
 
 
+FETCHED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
+SILENT = ("pre", "code", "script", "style", "annotation")
+
+
 class Page(HTMLParser):
     """Anchors, links, and what a browser would fetch; text that is no code."""
-
-    FETCHED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
-    SILENT = ("pre", "code", "script", "style", "annotation")
 
     def __init__(self, path):
         super().__init__()
@@ -48,18 +49,18 @@ class Page(HTMLParser):
         found = dict(attributes)
         self.anchors |= {found[k] for k in ("id", "name") if found.get(k)}
         self.maths += tag == "math"
-        self._silent += tag in self.SILENT
+        self._silent += tag in SILENT
         if tag == "a" and "href" in found:
             self.links.append(found["href"])
-        if found.get(self.FETCHED.get(tag)) and found.get("rel") not in (
+        if found.get(FETCHED.get(tag)) and found.get("rel") not in (
             "canonical",
             "next",
             "prev",
         ):
-            self.fetched.append(found[self.FETCHED[tag]])
+            self.fetched.append(found[FETCHED[tag]])
 
     def handle_endtag(self, tag):
-        self._silent -= tag in self.SILENT
+        self._silent -= tag in SILENT
 
     def handle_data(self, data):
         if not self._silent:
