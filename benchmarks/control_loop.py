@@ -2,15 +2,16 @@
 
     python benchmarks/control_loop.py [--seconds 60] [--rate 1000] [--spin-us 200] [--realtime]
 
-ONNX Runtime with the exported step alone, with its velocity, and `ImitationFlow.step` in NumPy, each
-in a loop with absolute deadlines: tick k is due at start + k / rate, whatever came before it. A loop
-sleeps until ``spin-us`` before a tick and then asks the clock until the tick is due. Garbage
-collection waits until the end. ``--realtime`` asks Linux for SCHED_FIFO, which needs the right to do
-so, and says when it is refused.
+ONNX Runtime with the exported step alone, with its velocity, and `ImitationFlow.step` in NumPy,
+each in a loop with absolute deadlines: tick k is due at start + k / rate, whatever came before it.
+A loop sleeps until ``spin-us`` before a tick and then asks the clock until the tick is due. Garbage
+collection waits until the end. ``--realtime`` asks Linux for SCHED_FIFO, which needs the right to
+do so, and says when it is refused.
 
 Printed for each way: the *jitter*, how late a tick begins; what a *command* takes; and the share of
-ticks whose command was not ready when the next one was due. The percentiles are of all ticks but the
-first 100. Run it on a machine that does nothing else: every other process is part of what it measures.
+ticks whose command was not ready when the next one was due. The percentiles are of all ticks but
+the first 100. Run it on a machine that does nothing else: every other process is part of what it
+measures.
 """
 
 import gc

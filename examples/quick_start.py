@@ -78,7 +78,7 @@ def run(push: Push | None, demonstration: int) -> np.ndarray:
     path = [observation]
     for _ in range(horizon):
         action, _ = policy.predict(observation)
-        observation, reward, terminated, truncated, info = env.step(action)
+        observation, *_, info = env.step(action)
         path.append(observation)
     print(f"ended {info['distance_to_goal']:.2f} mm from the goal")
     return np.stack(path)

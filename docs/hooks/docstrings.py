@@ -6,7 +6,8 @@ from typing import Any
 from griffe import Extension, Object
 
 MATH = re.compile(
-    r"^(?P<indent>[ ]*)\.\. math::[ ]*(?P<first>.*)\n(?P<rest>(?:(?P=indent)[ ]{4,}.*\n|[ ]*\n(?=(?P=indent)[ ]{4,}))*)",
+    r"^(?P<indent>[ ]*)\.\. math::[ ]*(?P<first>.*)\n"
+    r"(?P<rest>(?:(?P=indent)[ ]{4,}.*\n|[ ]*\n(?=(?P=indent)[ ]{4,}))*)",
     flags=re.M,
 )
 

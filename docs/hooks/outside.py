@@ -90,7 +90,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files, **_: A
             return f"{match['image']}[{text}]({there}{mark}{anchor})"
         if not os.path.exists(ROOT / target):  # mkdocs says which link is broken
             return match[0]
-        base = config.extra["source_url"].rstrip("/")
+        base = (config.extra["source_url"] or "").rstrip("/")  # an empty variable reads as None
         return f"[{text}]({base}/{target}{mark}{anchor})" if base else text
 
     # Every second piece is fenced code, which holds no links.

@@ -80,6 +80,15 @@ MODULES = {
 }
 """Page to the modules on it. A test sees that all modules of the package are somewhere."""
 
+INNER = {
+    "iflow_gym.datasets.handwriting",
+    "iflow_gym.envs.dynamics",
+    "iflow_gym.envs.nearest",
+    "iflow_gym.envs.rendering",
+    "iflow_gym.residual.composition",
+}
+"""Modules that nobody needs but those who change the package."""
+
 LONG = ("iflow_gym.metrics.registry",)
 """Modules whose values are too long to be shown."""
 LONG_VALUES = "    options: { show_attribute_values: false }\n"
