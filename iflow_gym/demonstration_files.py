@@ -204,7 +204,8 @@ def _checked(
             source=header["source"],
             held_out=header["held_out"],
         )
-    if not np.isfinite(demos.bounding_box.diagonal) or not np.isfinite(demos.peak_speed):
+        sizes = [demos.bounding_box.diagonal, demos.peak_speed]
+    if not np.isfinite(sizes).all():
         raise ValueError("its numbers are so large that their distances are infinite")
     if demos.sha256 != header["sha256"]:
         raise ValueError("its numbers are not those that were saved: their hash differs")

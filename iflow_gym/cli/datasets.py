@@ -192,9 +192,9 @@ class Data:
 
     Nothing is downloaded by itself but what an environment asks for.
 
-    iflow-gym data where
-    iflow-gym data fetch recorded-letters
-    iflow-gym data verify
+        iflow-gym data where
+        iflow-gym data fetch recorded-letters
+        iflow-gym data verify
     """
 
     command: (

@@ -120,8 +120,10 @@ class Fit:
 class Methods:
     """List the methods, or the settings of one.
 
-    iflow-gym methods
-    iflow-gym methods imitation-flow
+    Settings are what `iflow-gym fit` takes by --set.
+
+        iflow-gym methods
+        iflow-gym methods imitation-flow
     """
 
     method: Annotated[Positional[str | None], shown("[METHOD]")] = None

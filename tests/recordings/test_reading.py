@@ -2,16 +2,19 @@
 
 import contextlib
 import io
+import json
 import zipfile
 import zlib
 
 import numpy as np
 import pytest
+import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iflow_gym.recordings import Columns, RecordingError, read_recordings
 from iflow_gym.recordings.numpy_files import MOST_BYTES
+from iflow_gym.recordings.reading import Source
 
 T = np.arange(8) * 0.1
 P = np.stack([np.cos(T), T**2], axis=1)
