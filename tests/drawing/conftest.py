@@ -7,9 +7,6 @@ import sys
 
 import pytest
 
-pytest.importorskip("starlette", reason="the page needs its extra: pip install -e '.[draw]'")
-pytest.importorskip("uvicorn", reason="the page needs its extra: pip install -e '.[draw]'")
-
 
 class Server:
     """Where the page is, and where it saves."""
@@ -22,6 +19,8 @@ class Server:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory):
     """`python -m iflow_gym.drawing` with few steps; at the end Ctrl-C ends it without a word."""
+    for name in ("starlette", "uvicorn"):
+        pytest.importorskip(name, reason="the page needs its extra: pip install -e '.[draw]'")
     folder = tmp_path_factory.mktemp("drawing") / "saved"
     command = [sys.executable, "-m", "iflow_gym.drawing", "--port", "0", "--no-open"]
     command += ["--directory", str(folder), "--steps.preview", "20", "--steps.quick", "60"]

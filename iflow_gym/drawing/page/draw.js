@@ -539,6 +539,7 @@ document.addEventListener("keydown", (event) => {
 });
 $("clear").addEventListener("click", () => {
   setStrokes([]);
+  takeUp("draw");
   say("The strokes are cleared; Undo brings them back.");
 });
 
@@ -589,6 +590,7 @@ async function startFit() {
       strokes: page.strokes.map((stroke) => stroke.map((p) => p.map(rounded))),
     });
     if (mine !== page.asked) return;
+    say("Fitting …");
     removePoints(page.points);
     page.fit = { ...answer, version: 0, field: null, running: true, refined: false };
     page.changed = false;
@@ -657,8 +659,7 @@ async function show(fit) {
   drawField();
   offer();
   if (first) {
-    document.querySelector("input[value=run]").checked = true;
-    toolChanged();
+    takeUp("run");
     say("A first model is there: drop points on the sheet.");
   }
   const here = page.points.filter((p) => p !== page.held);
@@ -888,6 +889,11 @@ function offerMethods() {
 
 function toolChanged() {
   surface.classList.toggle("runs", chosen("tool") === "run");
+}
+
+function takeUp(tool) {
+  document.querySelector(`input[name=tool][value=${tool}]`).checked = true;
+  toolChanged();
 }
 
 for (const input of document.querySelectorAll("input[name=tool]")) input.addEventListener("change", toolChanged);

@@ -15,7 +15,13 @@ from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.baselines.orbit_field import OrbitField
 from iflow_gym.baselines.registry import METHODS
 from iflow_gym.drawing import ServingError, serve
-from iflow_gym.drawing.local_only import MOST_BYTES
+
+local_only = pytest.importorskip(
+    "iflow_gym.drawing.local_only",
+    reason="the page needs its extra: pip install -e '.[draw]'",
+    exc_type=ModuleNotFoundError,
+)
+MOST_BYTES = local_only.MOST_BYTES
 
 
 @pytest.fixture
@@ -75,8 +81,9 @@ def test_the_page_loads_nothing_from_elsewhere(ask):
     "host", ["evil.example", "evil.example:{port}", "127.0.0.1:1", "", "localhost"]
 )
 def test_a_foreign_host_is_refused(ask, server, host):
-    status, _, answer = ask("GET", "/", Host=host.format(port=server.port))
+    status, headers, answer = ask("GET", "/", Host=host.format(port=server.port))
     assert status == 421
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert "Expected the host" in answer["error"]
 
 
