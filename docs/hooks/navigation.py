@@ -18,7 +18,8 @@ EXAMPLES = ("quick_start", "own_data", "residual_rl")
 
 def title_of(path: Path) -> str:
     """Return the first heading of a Markdown file or of a script of cells, without its marks."""
-    match = re.search(r"^(?:# )?# (.+)$", path.read_text(encoding="utf-8"), flags=re.M)
+    mark = "# # " if path.suffix == ".py" else "# "
+    match = re.search(rf"^{mark}(.+)$", path.read_text(encoding="utf-8"), flags=re.M)
     if match is None:
         raise ValueError(f"Expected a heading in {path}, got none.")
     return match[1].replace("`", "")
