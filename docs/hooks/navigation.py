@@ -18,7 +18,8 @@ EXAMPLES = ("quick_start", "own_data", "residual_rl")
 
 def title_of(path: Path) -> str:
     """Return the first heading of a Markdown file or of a script of cells, without its marks."""
-    match = re.search(r"^(?:# )?# (.+)$", path.read_text(encoding="utf-8"), flags=re.M)
+    mark = "# # " if path.suffix == ".py" else "# "
+    match = re.search(rf"^{mark}(.+)$", path.read_text(encoding="utf-8"), flags=re.M)
     if match is None:
         raise ValueError(f"Expected a heading in {path}, got none.")
     return match[1].replace("`", "")
@@ -34,11 +35,17 @@ def methods() -> list[dict[str, str]]:
 
 
 def environments() -> list[dict[str, str]]:
-    """Return the overview, a page for each family, and what is written on some of them."""
-    written = [DOCS / "letters.md", DOCS / "drumming.md"]
-    pages = [*sorted((DOCS / "environments").glob("*.md")), *written]
-    listed = [{title_of(path): path.relative_to(DOCS).as_posix()} for path in pages]
-    return [{"Overview": "environments.md"}, *listed]
+    """Return the overview, the families in its order, and what is written on some of them."""
+    overview = (DOCS / "environments.md").read_text(encoding="utf-8")
+    pages = re.findall(r"\((environments/.+?\.md)\)", overview)
+    families = [{_family(title_of(DOCS / page)): page} for page in pages]
+    written = [{"On the letters": "letters.md"}, {"On drumming": "drumming.md"}]
+    return [{"Overview": "environments.md"}, *families, *written]
+
+
+def _family(env_id: str) -> str:
+    """Return what of ``iflow/LASA-<Shape>-v0`` names the family."""
+    return re.sub(r"^iflow/|-<\w+>|-v\d+$", "", env_id)
 
 
 def examples() -> list[dict[str, str]]:

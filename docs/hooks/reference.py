@@ -1,6 +1,5 @@
 """The reference, from docstrings: pages of the API, and what the page of each method ends with."""
 
-import dataclasses
 from typing import Any
 
 from mkdocs.structure.files import File, Files
@@ -94,7 +93,7 @@ LONG = ("iflow_gym.metrics.registry",)
 LONG_VALUES = "    options: { show_attribute_values: false }\n"
 
 NEEDS = {
-    "_step": "a step in closed form",
+    "_step": "a step of its own",
     "_lyapunov": "a Lyapunov function",
     "_log_prob": "a density of transitions",
 }
@@ -148,7 +147,6 @@ def method_reference(name: str) -> str:
         "next state": method.integrator,
     }
     rows = "\n".join(f"| {key} | {value} |" for key, value in facts.items())
-    fields = len(dataclasses.fields(method.Config))
     options = "    options: { show_root_full_path: false, heading_level: 3 }\n"
     return f"""
 
@@ -157,7 +155,6 @@ def method_reference(name: str) -> str:
 | `{method.__name__}` | |
 | --- | --- |
 {rows}
-| settings | {fields} |
 
 ::: {_path(method)}
 {options}
