@@ -384,6 +384,7 @@ function offer() {
   $("refine").hidden = !(shown && fit.refines && !running && !page.changed && !fit.refined);
   $("found").hidden = !shown;
   $("stale").hidden = !(shown && page.changed);
+  $("field").classList.toggle("stale", shown && page.changed);
   $("points-card").hidden = !shown;
   $("save-card").hidden = !shown;
   document.querySelector("input[value=run]").disabled = !shown;
