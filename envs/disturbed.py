@@ -24,7 +24,7 @@ from iflow_gym.envs.point_mass import PointMassEnv
 from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
 from iflow_gym.envs.task import PointMassInterface, Push
 
-MASS_RATIO = 6.0
+MASS_RATIO = 4.0
 """Mass of the plant over the nominal one."""
 
 DAMPING_RATIO = 3.0
@@ -250,7 +250,7 @@ class DisturbedEnv(_Disturbed, PointMassEnv):
     $$m' \dot v = F + F_\text{wind}(x, v) - c' v$$
 
     is integrated in closed form over a dt, with F and the wind at its beginning held. The goal lies
-    in the lee, so that a policy can come to rest there. The defaults, a load of five times the own
+    in the lee, so that a policy can come to rest there. The defaults, a load of three times the own
     mass and a light wind, are such that ImitationFlow still ends at the goal: a field commands
     little where the recordings were slow, and a stronger wind holds it there.
     `env.unwrapped.wind_force(x, v)` is for pictures and tests: a policy is not to look.
@@ -275,7 +275,7 @@ class DisturbedEnv(_Disturbed, PointMassEnv):
     ## Arguments
     | argument | default | meaning |
     | --- | --- | --- |
-    | `mass_ratio` | `6.0` | the plant's mass over the nominal one, > 0 |
+    | `mass_ratio` | `4.0` | the plant's mass over the nominal one, > 0 |
     | `damping_ratio` | `3.0` | the plant's damping over the nominal one, > 0 |
     | `wind` | `None` | a `Wind(strength, direction, curl, reach)`; `None` takes its defaults |
     | the rest | | as in `PointMassEnv`, but `control_mode` |

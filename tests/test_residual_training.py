@@ -355,6 +355,27 @@ def test_presets_and_settings_say_what_is_wrong(tmp_path):
         TrainingSettings(total_steps=0)
 
 
+def test_learning_from_scratch_explores_as_its_own_setting_says():
+    settings = load_settings("ppo")
+    assert settings.of_run(scratch=False) is settings
+    scratch = settings.of_run(scratch=True)
+    assert scratch.policy["log_std_init"] == settings.scratch_log_std_init
+    assert scratch.policy["log_std_init"] > settings.policy["log_std_init"]
+    assert dataclasses.replace(scratch, policy=settings.policy) == settings
+    assert load_settings("sac").of_run(scratch=True) == load_settings("sac")
+
+
+def test_hits_are_heard_where_there_are_drums_and_asked_for_nowhere_else():
+    env = residual_vec_env("iflow/Drumming-v0", 1, None, 0.4, False, 1.0, "hits")
+    env.seed(0)
+    env.reset()
+    assert "strokes" in env.env.step(np.zeros((1, 3)))[4]
+    with pytest.raises(ValueError, match="with drums for reward='hits', got 'iflow/Disturbed"):
+        batch_of(ENV, 2, "hits")
+    with pytest.raises(SettingsError, match="reward of environment, hits, got 'noise'"):
+        TrainingSettings(reward="noise")
+
+
 # Records ------------------------------------------------------------------------------------
 
 

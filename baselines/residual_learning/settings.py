@@ -37,6 +37,9 @@ class TrainingSettings:
     """Largest residual in greatest speeds."""
     scratch_scale: float = 0.4
     """The same where there is no base: twice the peak speed of recordings in the plane."""
+    scratch_log_std_init: float | None = None
+    """For PPO: the logarithm of the exploration's standard deviation at the beginning where there
+    is no base, in place of the policy's own: with nothing under it an agent has more to find."""
     reward: Reward = "environment"
     """What is learned from: the environment's own reward, or for drumming "hits", that of
     `iflow_gym.envs.hit_reward.HitReward`."""
@@ -70,6 +73,13 @@ class TrainingSettings:
         for name in ("total_steps", "num_envs", "n_evaluations", "n_checkpoints"):
             if not (isinstance(value := getattr(self, name), int) and value >= 1):
                 raise SettingsError(f"Expected {name} >= 1, a whole number, got {value!r}.")
+
+    def of_run(self, *, scratch: bool) -> TrainingSettings:
+        """Return the settings of a run with or without a base."""
+        if not scratch or self.scratch_log_std_init is None or self.algorithm != "ppo":
+            return self
+        policy = {**self.policy, "log_std_init": self.scratch_log_std_init}
+        return dataclasses.replace(self, policy=policy)
 
     def as_json(self) -> dict[str, Any]:
         """Return the settings as JSON holds them."""

@@ -159,7 +159,7 @@ def _learn(
     folder: Path, card: Card, total: int, start: Path | None, progress: bool, tensorboard: bool
 ) -> Trained:
     one_thread()
-    settings = settings_of(card)
+    settings = settings_of(card).of_run(scratch=card.base is None)
     base = load_base(folder, card)
     env = residual_vec_env(
         card.environment,
