@@ -170,15 +170,10 @@ def test_a_cycle_and_points_that_come_to_it(open_page):
     page.get_by_role("alert").get_by_text("Stroke 1").wait_for()
     assert "1.5 times" in page.get_by_role("alert").inner_text()
     page.get_by_role("button", name="Delete stroke 1").click()
-    draw(page, ellipse(3, 0.8))
+    page.get_by_role("button", name="Example").click()
     fit(page)
     page.get_by_role("button", name="Drop 25").click()
-    page.locator("#places li").nth(24).wait_for(state="attached")
-    far = 99.0
-    while far > 5:  # millimetres, of the points' farthest: the test's timeout ends it
-        said = page.locator("#count").inner_text()
-        far = float(re.search(r"at most (\S+) mm", said).group(1))
-        page.wait_for_timeout(100)
+    page.get_by_text(re.compile(r"25 points, at most [0-4]\.\d mm from your strokes")).wait_for()
     before = places(page)
     page.wait_for_timeout(300)
     assert max(np.linalg.norm(np.subtract(places(page), before), axis=1)) > 5  # they go on
