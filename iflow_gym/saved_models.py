@@ -31,8 +31,8 @@ MOST_BYTES = 2**26
 MOST_HEADER_BYTES = 2**20
 """Of its header: parsed JSON takes up to a hundred times its length."""
 
-MOST_ROWS: Mapping[str, Mapping[str, int]] = {"gpr": {"inducing": 4000}}
-"""Rows of arrays by method, where loading builds a matrix of rows x rows."""
+MOST_ROWS: Mapping[str, int] = {"inducing": 4000}
+"""Rows of arrays by name, where loading builds a matrix of rows x rows."""
 
 ITEM_BYTES = {"F16": 2, "F32": 4, "F64": 8}
 """Of an array's numbers, by safetensors' names of their types."""
@@ -146,7 +146,7 @@ def load_model(
     info = inspect_model(path, most_bytes=most_bytes)
     with _refusals(info.path):
         cls = _registered(info.method) if method is None else method
-        for name, most in MOST_ROWS.get(info.method, {}).items():
+        for name, most in MOST_ROWS.items():
             if (shape := info.shapes.get(name, ())) and shape[0] > most:
                 raise ValueError(f"expected at most {most} rows of {name!r}, got {shape[0]}")
         try:

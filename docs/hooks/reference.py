@@ -22,6 +22,7 @@ API = {
 MODULES = {
     "demonstrations": (
         "iflow_gym.demonstrations",
+        "iflow_gym.demonstration_files",
         "iflow_gym.datasets.lasa",
         "iflow_gym.datasets.letters",
         "iflow_gym.datasets.drums",
@@ -35,6 +36,8 @@ MODULES = {
         "iflow_gym.policy",
         "iflow_gym.partial_fits",
         "iflow_gym.model_files",
+        "iflow_gym.saved_models",
+        "iflow_gym.models",
         "iflow_gym.baselines.registry",
     ),
     "environments": (
@@ -46,6 +49,7 @@ MODULES = {
         "iflow_gym.envs.lasa",
         "iflow_gym.envs.letters",
         "iflow_gym.envs.disturbed",
+        "iflow_gym.envs.hit_reward",
         "iflow_gym.envs.drumming.env",
         "iflow_gym.envs.drumming.recorded",
     ),

@@ -369,10 +369,10 @@ def test_what_is_no_file_is_refused(tmp_path):
         load_model(tmp_path / "pipe")
 
 
-@pytest.mark.parametrize("name", MOST_ROWS)
+@pytest.mark.parametrize("name", ["gpr"])
 def test_a_small_file_that_asks_for_a_huge_matrix_is_refused(name, saved, tmp_path):
     _, header, arrays = saved
-    (key, most), *_ = MOST_ROWS[name].items()
+    ((key, most),) = MOST_ROWS.items()
     n = len(arrays[key])
     many = {
         k: np.tile(a, (-(-(most + 1) // n), 1)) if len(a) == n else a for k, a in arrays.items()

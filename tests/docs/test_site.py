@@ -3,6 +3,7 @@
 One build, in a process of its own; what is said of the site is read from its HTML.
 """
 
+import fcntl
 import importlib.util
 import os
 import re
@@ -69,7 +70,22 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    place = tmp_path_factory.mktemp("site")
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    place = shared / "site"
+    with open(shared / "site.lock", "w") as lock:  # half a minute: once for all workers
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (place / "sitemap.xml").exists():
+            build(place)
+    # The board is a page of its own, with tests of its own.
+    return {
+        path.relative_to(place).as_posix(): path if path.suffix != ".html" else Page(path)
+        for path in sorted(place.rglob("*"))
+        if path.is_file()
+    }
+
+
+def build(place):
     settings = {
         "NO_MKDOCS_2_WARNING": "1",
         "PYTHONPATH": str(ROOT),
@@ -86,12 +102,6 @@ def site(tmp_path_factory):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    # The board is a page of its own, with tests of its own.
-    return {
-        path.relative_to(place).as_posix(): path if path.suffix != ".html" else Page(path)
-        for path in sorted(place.rglob("*"))
-        if path.is_file()
-    }
 
 
 def pages(site):
