@@ -6,8 +6,9 @@
 An episode is a recording. It begins at the recording's first sample, and each action is the one
 that leads from where the environment is to the recording's next sample, rounded to the action
 space's float32; rewards and observations are the environment's own answers. So every transition is
-real, and playing an episode's actions gives its observations back bit for bit. A point mass follows its
-recording to that rounding; the arm stays within millimetres of it. The extra ``minari`` is needed.
+real, and playing an episode's actions gives its observations back bit for bit. A point mass follows
+its recording to that rounding; the arm stays within millimetres of it. The extra ``minari`` is
+needed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Model files as anyone may have made them: a working model, or the clear error, and no more memory.
+"""Model files as anyone may have made them: a working model, or the clear error, and no memory.
 
 The models are those of `test_methods`, one of each registered method.
 """
@@ -85,7 +85,7 @@ def damaged(data, content):
 
 @every_method
 @settings(
-    max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
 def test_a_damaged_file_is_a_working_model_or_the_clear_error(name, folder, data):
