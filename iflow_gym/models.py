@@ -63,12 +63,12 @@ def load_model(path: str | os.PathLike[str], method: str | None = None) -> Metho
     header = model_header(path)
     said = header.get("method")
     if method is None:
-        if said not in METHODS:
+        if not isinstance(said, str) or said not in METHODS:
             raise ModelFileError(
                 f"Expected {path} to hold a model of {', '.join(sorted(METHODS))}, got "
                 f"{said!r:.60}: of a class of your own say which it is, module:Class (--method)."
             )
-        method = str(said)
+        method = said
     cls = load_method(method)
     try:
         loaded = cls.load(path)

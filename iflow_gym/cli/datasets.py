@@ -187,20 +187,63 @@ def _checks(name: str) -> list[tuple[str, Callable[[], object]]]:
 
 
 @dataclass(frozen=True)
+class ExportMinari:
+    """Write demonstrations as Minari datasets, such as iflow/LASA-Angle/human-v0.
+
+    Each recording is played in its environment, so that every transition is real; Minari's
+    recover_environment gives the environment back. Needs the extra minari. Drumming takes a minute,
+    because the arm is simulated.
+
+        iflow-gym data export-minari LASA-Angle 'Letter-*'
+        iflow-gym data export-minari '*' --folder datasets --replace
+    """
+
+    patterns: Annotated[Positional[tuple[str, ...]], shown("ENVIRONMENT...")]
+    """Globs over ids or short names of `iflow-gym envs`."""
+    folder: Annotated[Path | None, shown("FOLDER")] = None
+    """Folder of the datasets; by default Minari's own, which MINARI_DATASETS_PATH names."""
+    replace: bool = False
+    """Write over datasets that are there already."""
+
+    def run(self) -> int:
+        """Export."""
+        from iflow_gym.minari_datasets import (
+            chosen_environments,
+            dataset_id_of,
+            export_minari,
+        )
+
+        try:
+            chosen = chosen_environments(self.patterns)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+        if not chosen:
+            raise UsageError("Expected environments to export, such as LASA-Angle, got none.")
+        with counted("Exporting", len(chosen)) as advance:
+            for env_id in chosen:
+                export_minari(env_id, root=self.folder, overwrite=self.replace)
+                print(dataset_id_of(env_id))
+                advance()
+        return 0
+
+
+@dataclass(frozen=True)
 class Data:
-    """The recordings that the suite's environments hand out: where, fetch, verify.
+    """The recordings that the suite's environments hand out: where, fetch, verify, export.
 
     Nothing is downloaded by itself but what an environment asks for.
 
         iflow-gym data where
         iflow-gym data fetch recorded-letters
         iflow-gym data verify
+        iflow-gym data export-minari LASA-Angle
     """
 
     command: (
         Annotated[Where, subcommand("where")]
         | Annotated[Fetch, subcommand("fetch")]
         | Annotated[Verify, subcommand("verify")]
+        | Annotated[ExportMinari, subcommand("export-minari")]
     )
 
     def run(self) -> int:

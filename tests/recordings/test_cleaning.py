@@ -197,7 +197,7 @@ def test_later_versions_and_foreign_files_say_what_to_do(tmp_path):
         load_demonstrations(tmp_path / "absent")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_a_damaged_file_is_told_and_never_read_as_another_motion(data):
     whole = demonstrations_from_bytes(SMALL, "it").demonstrations

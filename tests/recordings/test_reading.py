@@ -263,7 +263,7 @@ FUZZED = {
 
 
 @pytest.mark.parametrize("name", FUZZED)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(data=st.data())
 def test_a_damaged_file_gives_recordings_or_the_clear_error(name, data):
     content = bytearray(FUZZED[name])
