@@ -10,6 +10,7 @@ from tyro.conf import OmitSubcommandPrefixes, subcommand
 from iflow_gym.cli.board import Leaderboard
 from iflow_gym.cli.console import Command
 from iflow_gym.cli.datasets import Data
+from iflow_gym.cli.drawing import Draw
 from iflow_gym.cli.environments import Envs
 from iflow_gym.cli.exporting import Export
 from iflow_gym.cli.fitting import Fit, Methods
@@ -28,6 +29,7 @@ COMMANDS = {
     "rollout": Rollout,
     "plot": Plot,
     "export": Export,
+    "draw": Draw,
     "leaderboard": Leaderboard,
 }
 """By name, in the order of the help."""

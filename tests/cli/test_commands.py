@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 
@@ -289,6 +290,16 @@ def test_rollouts_from_a_file_of_starts_and_of_a_motion(call, folder):
         "rollout", "linear.safetensors", "--motion", "angle.safetensors", "-o", "paths.csv"
     )
     assert (status, "7 rollouts" in said) == (0, True)
+
+
+def test_draw_says_why_it_cannot_serve(call):
+    """On a port that is taken."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        status, output, errors = call("draw", "--no-open", "--port", str(taken.getsockname()[1]))
+    assert (status, output) == (1, "")
+    assert "port" in errors
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg"])
