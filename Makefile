@@ -9,7 +9,7 @@ BOARD := $(if $(filter smoke,$(PRESET)),results/smoke-board,leaderboard)
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help leaderboard check test lint wheel clean
+.PHONY: help leaderboard check test lint wheel site clean
 .DEFAULT_GOAL := help
 
 help:
@@ -18,11 +18,12 @@ help:
 	@echo "make check         check leaderboard/results: records, hashes, the board that they make"
 	@echo "make test          run the tests, the linter and the type checker"
 	@echo "make wheel         build the wheel, install it into an empty environment, try it there"
+	@echo "make site          build the documentation into site/, warnings are errors"
 
 $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "Installing into $(VENV) ..."
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test,dev]'
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test,dev,docs]'
 	@touch $@
 
 # A failed cell has its place on the board, so the board is built then, too.
@@ -50,5 +51,10 @@ lint: $(STAMP)
 wheel: $(STAMP)
 	VENV=$(VENV) PYTHON=$(PYTHON) tests/wheel.sh
 
+# SITE_URL and SOURCE_URL may be set: see mkdocs.yml.
+site: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --site-dir site
+	@echo "site/index.html; with a search: $(BIN)/python -m http.server --directory site"
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info results
+	rm -rf $(VENV) site build dist *.egg-info results

@@ -210,28 +210,32 @@ def default_output(preset: str) -> Path:
 def main() -> None:
     """Run from the command line."""
     import tyro
+
+    sys.exit(run_and_tell(tyro.cli(RunOptions, description=__doc__)))
+
+
+def run_and_tell(options: RunOptions) -> int:
+    """Run what `options` say, tell what went wrong on standard error, return the exit status."""
     from rich.console import Console
 
-    options = tyro.cli(RunOptions, description=__doc__)
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # for --methods my_module:MyMethod
     signal.signal(signal.SIGTERM, _stop)  # so that workers do not outlive this process
     try:
         # A log has no width; the table at the end needs some.
-        status = run_all(options, Console(width=None if sys.stdout.isatty() else 140))
+        return run_all(options, Console(width=None if sys.stdout.isatty() else 140))
     except KeyboardInterrupt:
         print("Stopped. What is done is kept; the next run goes on from there.", file=sys.stderr)
-        status = 130
+        return 130
     except ValueError as error:
         print(f"run_all.py: {error}", file=sys.stderr)
-        status = 2
+        return 2
     except (RuntimeError, OSError) as error:
         text = _why_it_ended(error)
         if text is None:
             raise
         print(f"run_all.py: {text}", file=sys.stderr)
-        status = 3
-    sys.exit(status)
+        return 3
 
 
 def _why_it_ended(error: RuntimeError | OSError) -> str | None:

@@ -18,7 +18,8 @@ from itertools import cycle, islice
 import torch
 import tyro
 
-from iflow_gym.baselines.imitation_flow import ImitationFlow, ImitationFlowConfig
+from iflow_gym.baselines.imitation_flow import ImitationFlow
+from iflow_gym.baselines.imitation_flow.config import ENDS
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS, load_lasa
 
 
@@ -72,7 +73,7 @@ def main() -> None:
         command += ["--n-steps", str(options.n_steps), "--device", options.device]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         found = json.loads(done.stdout.splitlines()[-1])
-        whole = found["step_ms"] * ImitationFlowConfig.n_steps / 1e3
+        whole = found["step_ms"] * ENDS.n_steps / 1e3
         print(
             f"{count:7} {found['step_ms']:10.2f} {found['step_ms'] / count:8.3f} "
             f"{found['memory_mb']:10.0f} {whole:12.0f}",

@@ -1,17 +1,22 @@
 """Writes the pages that are made of code: `python docs/generate.py`.
 
-docs/environments.md from the environments' docstrings, docs/metrics.md from the registry of
-metrics, the tables of results in the README and on the page of residuals from the committed
+docs/environments.md and a page for each family of environments from their docstrings,
+docs/metrics.md from the registry of metrics, the tables of results in the README and on the page of
+residuals from the committed
 records. A test compares the pages with
 what this would write.
 """
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
@@ -45,14 +50,132 @@ OF = {
 """Kinds of motion, in words."""
 
 
+@dataclass(frozen=True)
+class Family:
+    """Environments of one class, with a page of their own."""
+
+    page: str
+    """Name of the page in docs/environments."""
+    ids: str
+    """Their id, with what differs in angle brackets."""
+    words: str
+    """What they are, for the overview."""
+    environment: type[Any]
+    """Class whose docstring is the page."""
+    picture: str
+    """File in docs/images."""
+    shows: str
+    """What the picture shows, for those who do not see it."""
+    caption: str = ""
+    """What is to be said below it."""
+    members: tuple[str, ...] = ()
+    """Ids; none where the docstring or the overview has it."""
+    facts: bool = False
+    """Whether the demonstrations of each are told in a table: they come with the package."""
+    example: str = ""
+    """How one is made; by default by the first id alone."""
+    more: str = ""
+    """What follows the docstring."""
+
+
+SHAPES = (*SINGLE_MOTIONS, *MULTI_MODELS)
+
+FAMILIES = (
+    Family(
+        "point-mass",
+        POINT_MASS_ID,
+        "your own recordings, in any number of dimensions",
+        PointMassEnv,
+        "environment.png",
+        "A frame: stream lines of a policy, the recordings, the mass",
+        '`gym.make(..., policy=system, render_mode="rgb_array")`: the stream lines of `system`, '
+        "deeper where it is faster, the recordings, and the mass on its way.",
+        example=f'gym.make("{POINT_MASS_ID}", demonstrations=Demonstrations.from_arrays(...))',
+        more="[Your own data](../your-own-data.md) says how recordings become `Demonstrations`.",
+    ),
+    Family(
+        "lasa",
+        "iflow/LASA-<Shape>-v0",
+        "30 handwriting motions that end at a goal",
+        LASAEnv,
+        "lasa.png",
+        "The seven recordings of each of the thirty shapes, ending at a star",
+        "Rings are where recordings begin, stars where they end. The last four hold two or three "
+        "motions each.",
+        tuple(map(lasa_id, SHAPES)),
+        facts=True,
+    ),
+    Family(
+        "letter",
+        "iflow/Letter-<Letter>-v0",
+        "four letters traced round and round, by a model of handwriting",
+        LetterEnv,
+        "letters.png",
+        "The suite's letters beside recorded ones",
+        members=tuple(letter_id(letter) for letter in LETTERS),
+        facts=True,
+        more="[How the letters are made](../letters.md), and how they compare with recorded ones.",
+    ),
+    Family(
+        "letter-recorded",
+        "iflow/LetterRecorded-<Letter>-v0",
+        "the letters that ImitationFlow's authors recorded",
+        LetterRecordedEnv,
+        "letters-recorded.png",
+        "The recordings of I, R, O and S",
+        members=tuple(letter_id(letter, recorded=True) for letter in LETTERS),
+        more="[The recorded letters](../letters.md#the-recorded-letters-and-the-drumming): where "
+        "they come from, and how to use them without a network.",
+    ),
+    Family(
+        "disturbed",
+        "iflow/Disturbed-<Shape>-v0",
+        "a LASA shape, a plant of unknown mass, and wind",
+        DisturbedLASAEnv,
+        "disturbed.png",
+        "Paths on the nominal plant, and on the disturbed one, where they are late and stop short",
+        "The same ImitationFlow commands both plants, for as long as each recording lasts. The one "
+        "on the right is heavier than its controller is told and lags behind, in the wind of the "
+        "arrows: the motion is late.",
+        tuple(map(disturbed_id, SHAPES)),
+        more=f"""With your own recordings: `iflow_gym.envs.disturbed.DisturbedEnv(demonstrations)`.
+[Residuals on a learned motion](../residual.md) are what it is for.
+
+# The plant
+
+{inspect.getdoc(DisturbedEnv)}
+
+# Wind
+
+{inspect.getdoc(Wind)}""",
+    ),
+    Family(
+        "drumming",
+        DRUMMING_ID,
+        "an arm in MuJoCo that drums",
+        DrummingEnv,
+        "drumming.gif",
+        "The arm plays one round",
+        "A demonstration replayed: over a high arch to the right drum, over a low one to the left. "
+        "A head that is hit turns yellow; the blue line is the tip's way in the last 0.6 s.",
+        more="[Drumming](../drumming.md): an example, what the scores mean, and what is learned.",
+    ),
+    Family(
+        "drumming-recorded",
+        DRUMMING_RECORDED_ID,
+        "the same arm, and the recording of ImitationFlow's authors",
+        DrummingRecordedEnv,
+        "drumming-recorded.png",
+        "Six recordings in space, over two drums, and how high the tip is over time",
+        "The recordings, shifted into the arm's workspace, and the drums set under their strokes.",
+    ),
+)
+"""Every registered id is of one of them: a test sees that."""
+
+
 def environments() -> str:
-    """Return the page of the environments."""
-    ids = "\n".join(f"- `{lasa_id(shape)}`" for shape in (*SINGLE_MOTIONS, *MULTI_MODELS))
-    letters = "\n".join(
-        f"- `{letter_id(letter, recorded=recorded)}`"
-        for recorded in (False, True)
-        for letter in LETTERS
-    )
+    """Return the page that leads to the families."""
+    rows = "\n".join(f"| [`{f.ids}`](environments/{f.page}.md) | {f.words} |" for f in FAMILIES)
     return f"""# Environments
 
 ![A frame: stream lines of a policy, the recordings, the mass](images/environment.png)
@@ -60,55 +183,58 @@ def environments() -> str:
 *`gym.make("iflow/LASA-Sshape-v0", policy=system, render_mode="rgb_array")`: the stream lines of
 `system`, deeper where it is faster, the recordings, and the mass on its way.*
 
+| id | |
+| --- | --- |
+{rows}
+
 `import iflow_gym` registers the environments. `"iflow_gym:iflow/LASA-Angle-v0"` imports it by
-itself, in another process for instance. Rendering needs no OpenGL.
+itself, in another process for instance. Rendering needs no OpenGL, but for the drumming arm.
 
 The batched version steps all at once in NumPy and gives the bits that the single one gives:
 `gym.make_vec(id, num_envs=1024, vectorization_mode="vector_entry_point")`.
 
-# `{POINT_MASS_ID}`: your own recordings
-
-`gym.make("{POINT_MASS_ID}", demonstrations=Demonstrations.from_arrays(...))`
-
-{inspect.getdoc(PointMassEnv)}
-
-# `iflow/LASA-<Shape>-v0`
-
-{inspect.getdoc(LASAEnv)}
-
-## Ids
-
-{ids}
-
-# `iflow/Letter-<Letter>-v0`
-
-{inspect.getdoc(LetterEnv)}
-
-![The suite's letters beside recorded ones](images/letters.png)
-
-[How they are made](letters.md), and how they compare with recorded ones.
-
-# `iflow/LetterRecorded-<Letter>-v0`
-
-{inspect.getdoc(LetterRecordedEnv)}
-
-## Ids
-
-{letters}
-
-# `iflow/Disturbed-<Shape>-v0`
-
-{inspect.getdoc(DisturbedLASAEnv)} One for every shape above, such as
-`{disturbed_id("Angle")}`; with your own recordings
-`iflow_gym.envs.disturbed.DisturbedEnv(demonstrations)`. [Residuals on a learned
-motion](residual.md) are what it is for.
-
-{inspect.getdoc(DisturbedEnv)}
-
-## Wind
-
-{inspect.getdoc(Wind)}
+All have the demonstrations, a dataset of transitions and a score built in, on the unwrapped
+environment: `demonstrations`, `get_dataset(split)` and `score(system, seed=0)`. To add one, see
+[adding an environment](adding-an-environment.md).
 """
+
+
+def facts(ids: Sequence[str]) -> str:
+    """Return a table of the demonstrations of environments."""
+    rows = []
+    for env_id in ids:
+        demos = gymnasium.make(env_id).unwrapped.demonstrations
+        samples = sorted({len(p) for p in demos.positions})
+        counts = "–".join(dict.fromkeys(str(n) for n in (samples[0], samples[-1])))
+        size = " × ".join(
+            f"{side:.0f}" for side in demos.bounding_box.high - demos.bounding_box.low
+        )
+        peak = max(float(np.linalg.norm(v, axis=1).max()) for v in demos.velocities)
+        cells = (f"{demos.durations.mean():.3g}", size, f"{peak:.1f}")
+        rows.append(" | ".join([f"| `{env_id}`", str(len(demos)), counts, *cells]) + " |")
+    unit = demos.length_unit
+    head = f"| id | recordings | samples | duration (s) | size ({unit}) | peak speed ({unit}/s) |"
+    rule = "| --- | ---: | ---: | ---: | ---: | ---: |"
+    return "\n".join([head, rule, *rows])
+
+
+def family_page(family: Family) -> str:
+    """Return the page of a family of environments."""
+    example = family.example or f'gym.make("{(family.members or (family.ids,))[0]}")'
+    parts = [
+        f"# `{family.ids}`",
+        f"![{family.shows}](../images/{family.picture})",
+        f"*{family.caption}*" if family.caption else "",
+        f"`{example}`",
+        inspect.getdoc(family.environment) or "",
+        family.more,
+    ]
+    if family.members:
+        listed = "\n".join(f"- `{env_id}`" for env_id in family.members)
+        parts += ["## Ids", facts(family.members) if family.facts else listed]
+    text = "\n\n".join(part for part in parts if part)
+    # Headings of a docstring stand on their own; tables and text are to be apart from them.
+    return re.sub(r"^(#+ .*)\n(?=[^\n#])", r"\1\n\n", text, flags=re.M) + "\n"
 
 
 def drumming() -> str:
@@ -117,6 +243,9 @@ def drumming() -> str:
         f"| `{m.name}` | {m.definition} |" for m in METRICS if m.motions == ("drumming",)
     )
     return f"""# Drumming
+
+[`{DRUMMING_ID}`](environments/drumming.md) and
+[`{DRUMMING_RECORDED_ID}`](environments/drumming-recorded.md): an arm with a stick, and two drums.
 
 ![The arm plays one round](images/drumming.gif)
 
@@ -204,14 +333,6 @@ the round: where way down and way up lie side by side the nearest point of the o
 `render_mode="rgb_array"` needs OpenGL, everything else does not. Without a display, EGL (Debian's
 libegl1) or OSMesa (libosmesa6) does; `MUJOCO_GL=egl` or `MUJOCO_GL=osmesa` chooses, to be set
 before Python starts. Where it is not set, EGL is taken if it is there, else OSMesa.
-
-# `{DRUMMING_ID}`
-
-{inspect.getdoc(DrummingEnv)}
-
-# `{DRUMMING_RECORDED_ID}`
-
-{inspect.getdoc(DrummingRecordedEnv)}
 
 ## Licences
 The arm's model and meshes are read from gymnasium-robotics, where they are under the Apache
@@ -414,7 +535,7 @@ PAGES = {
     "metrics.md": metrics,
     "residual.md": residual,
     "../README.md": readme,
-}
+} | {f"environments/{family.page}.md": partial(family_page, family) for family in FAMILIES}
 
 if __name__ == "__main__":
     for name, page in PAGES.items():

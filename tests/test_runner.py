@@ -372,7 +372,7 @@ def test_an_interrupted_run_keeps_what_is_done_and_the_next_one_goes_on(toys, tm
     while len(list(output.glob("*/*.json"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.1)
     process.send_signal(stop)
-    printed, errors = process.communicate(timeout=20)
+    printed, errors = process.communicate(timeout=100)
     assert process.returncode == (130 if stop == signal.SIGINT else 128 + stop)
     assert re.search(r"^\d\d:\d\d:\d\d 3 cells, 0 up to date", printed)
     if stop == signal.SIGINT:

@@ -21,8 +21,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from iflow_gym.demonstrations import FloatArray
 
@@ -112,6 +110,8 @@ class Outline:
     """
 
     def __init__(self, via: FloatArray, hand: Hand) -> None:
+        from scipy.interpolate import CubicSpline  # here: importing scipy takes most of a second
+
         self.via = via
         self.height = float(np.ptp(via[:, 1]))
         weights = _smooth_weights(via, hand.rounding * self.height)
@@ -230,6 +230,8 @@ def _smooth_weights(via: FloatArray, rounding: float) -> FloatArray:
     interpolation", Computer-Aided Design 21, 1989), which makes no loops; the knots are evenly
     spaced along the curve.
     """
+    from scipy.interpolate import CubicSpline
+
     nodes = _closed(np.cumsum(np.hypot(*(via - np.roll(via, 1, axis=0)).T) ** 0.5))
     nodes[1:] -= nodes[0]
     nodes[0] = 0.0
@@ -251,6 +253,8 @@ def _phases(curve: FloatArray, height: float, hand: Hand) -> FloatArray:
     Shape (n + 1,) for a curve, shape (n, 2), that is sampled evenly enough for derivatives by
     Fourier series.
     """
+    from scipy.interpolate import CubicSpline
+
     first, second = (_derivative(curve, order) for order in (1, 2))
     stride = np.hypot(*first.T)
     curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / stride**3
@@ -280,6 +284,8 @@ def _uniform(bits: np.random.PCG64, shape: tuple[int, ...]) -> FloatArray:
 
 def _wander(noise: FloatArray, lag: float) -> FloatArray:
     """Pass noise through three lags of so many samples, scaled to variance 1."""
+    from scipy.signal import lfilter
+
     poles = np.array([1.0, -np.exp(-1 / lag)])
 
     def lagged(samples: FloatArray) -> FloatArray:
@@ -292,6 +298,8 @@ def _wander(noise: FloatArray, lag: float) -> FloatArray:
 
 def _band(noise: FloatArray, frequency: float, width: float) -> FloatArray:
     """Pass noise through a resonance, both in cycles a sample, scaled to variance 1."""
+    from scipy.signal import lfilter
+
     radius = np.exp(-np.pi * width)
     poles = [1.0, -2 * radius * np.cos(2 * np.pi * frequency), radius**2]
 

@@ -179,22 +179,43 @@ def _content(key: str, mirror: str | Path | None) -> bytes:
     return content
 
 
+def local_file(key: str, mirror: str | Path | None = None) -> Path:
+    """Return where a recording is looked for on this machine, be it there or not.
+
+    `key` is one of `FILES`; for `mirror` see `load_recorded_letter`.
+    """
+    file = FILES[key]
+    if named := mirror or os.environ.get(MIRROR_VARIABLE):
+        return Path(named).expanduser() / file.mirrored
+    return _cache() / _cached_name(file)
+
+
+def _cache() -> Path:
+    import pooch  # here, because a mirror needs no downloads
+
+    return Path(pooch.os_cache("iflow-gym")) / COMMIT[:7]
+
+
+def _cached_name(file: RecordedFile) -> str:
+    return file.path.replace("/", "-")
+
+
 def _downloaded(file: RecordedFile) -> Path:
     """Return the file in the cache, downloaded into it where it is not there yet.
 
     pooch writes beside the file and moves it into its place once the hash is right: what is
     interrupted leaves nothing behind.
     """
-    import pooch  # here, because a mirror needs no downloads
+    import pooch
 
-    cache = Path(pooch.os_cache("iflow-gym")) / COMMIT[:7]
+    cache = _cache()
     try:
         with _quiet(pooch.get_logger()):
             return Path(
                 pooch.retrieve(
                     _url(file),
                     known_hash=f"sha256:{file.sha256}",
-                    fname=file.path.replace("/", "-"),
+                    fname=_cached_name(file),
                     path=cache,
                 )
             )

@@ -12,8 +12,9 @@ import gymnasium
 from iflow_gym.baselines.registry import load_method, load_reference
 from iflow_gym.baselines.runner.fingerprint import hardware, versions
 from iflow_gym.evaluate import FIT_COSTS, Evaluation, evaluate
-from iflow_gym.model_files import read_model_file
 from iflow_gym.results import Result
+from iflow_gym.saved_models import inspect_model
+from iflow_gym.saved_models import load_model as load_saved_model
 from iflow_gym.system import Method
 
 NOT_COMPARED = frozenset({*FIT_COSTS, "step_us"})
@@ -71,9 +72,8 @@ def load_model(result: Result, folder: Path) -> Method:
     assert result.target is not None
     assert result.model is not None
     path = folder / result.model
-    header, _ = read_model_file(path)
-    method = load_method(result.target).load(path)
-    if header["config"] != result.config:
+    method: Method = load_saved_model(path, method=load_method(result.target))
+    if inspect_model(path).config != result.config:
         raise ValueError("expected the model to have the settings of the record, got other ones")
     return method
 

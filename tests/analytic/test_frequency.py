@@ -94,7 +94,7 @@ class TestTempo:
         assert 4.49 * 2 * np.pi / (turned[-1] - turned[0]) == pytest.approx(1.5, rel=0.01)
 
 
-@pytest.mark.parametrize(("cyclic", "steps", "slope"), [(False, 4000, 3.0), (True, 1500, 1.5)])
+@pytest.mark.parametrize(("cyclic", "steps", "slope"), [(False, 4500, 3.0), (True, 1500, 1.5)])
 def test_defaults_are_those_of_the_kind_of_motion_until_they_are_given(cyclic, steps, slope):
     config, given = ImitationFlowConfig(), ImitationFlowConfig(n_steps=7, sharpness=2.0)
     for settings, expected in ((config, (steps, slope)), (given, (7, 2.0))):

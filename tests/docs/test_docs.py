@@ -20,7 +20,8 @@ def load(path):
     return module
 
 
-python_snippets = load(Path(__file__).with_name("snippets.py")).python_snippets
+_snippets = load(Path(__file__).with_name("snippets.py"))
+python_snippets, snippets = _snippets.python_snippets, _snippets.snippets
 
 SNIPPETS = [
     pytest.param(text, id=f"{page.relative_to(ROOT)}-{i}")
@@ -45,6 +46,59 @@ def test_snippet_runs_from_a_neutral_folder(snippet, tmp_path):
     assert done.returncode == 0, done.stderr
     for line, said in re.findall(r"^(print\(.*?\))  # (True|False|proved)", snippet, flags=re.M):
         assert said in done.stdout, f"{line} was to print {said}:\n{done.stdout}"
+
+
+COMMANDS = """\
+import contextlib, runpy, shlex, sys
+from iflow_gym.cli import run
+
+for line in open(sys.argv[1]):
+    words = shlex.split(line)
+    output = sys.stdout
+    if ">" in words:
+        words, output = words[:-2], open(words[-1], "w")
+    with contextlib.redirect_stdout(output):
+        if words[0] == "python":
+            runpy.run_path(words[1])
+        else:
+            assert words[0] == "iflow-gym" and run(words[1:]) == 0, line
+    output.flush()
+"""
+"""Runs a page's commands in one process, which imports what is heavy once."""
+
+
+def test_the_commands_of_the_page_on_own_motions_run_one_after_another(tmp_path):
+    """As a person types them, in a folder with the recording."""
+    page = ROOT / "docs" / "your-own-motions.md"
+    commands = "".join(snippets(page, "sh"))
+    assert commands.count("iflow-gym ") >= 5
+    (tmp_path / "commands").write_text(commands)
+    (tmp_path / "run_all.py").write_text(COMMANDS)
+    drawn = subprocess.run(
+        [sys.executable, ROOT / "docs" / "hand_drawn.py"], capture_output=True, check=True
+    )
+    (tmp_path / "reach.csv").write_bytes(drawn.stdout)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "run_all.py", "commands"],
+        cwd=tmp_path,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Stability: proved." in done.stdout
+    made = {p.name for p in tmp_path.iterdir()}
+    assert {"reach.png", "field.png", "policy.onnx", "unseen.json", "path.csv"} <= made
+    said = [
+        line
+        for line in page.read_text().splitlines()
+        if line.startswith(("reach.csv", "lengths", "the motion"))
+    ]
+    assert len(said) >= 6
+    for line in said:
+        assert line in done.stderr, f"the page quotes a line that is not said: {line}"
 
 
 def test_there_are_snippets():
