@@ -377,7 +377,7 @@ def _named(
     candidates = [f"{k}{suffix}" for k in said or known] + list(said or ())
     found = next((lowered[c.lower()] for c in candidates if c.lower() in lowered), None)
     if said and found is None:
-        _known(said[0], list(numbers), name)
+        found = _known(said[0], list(numbers), name)
     if found is None and suffix:  # times that all recordings share
         found = next((lowered[k] for k in known if k in lowered), None)
     return found
