@@ -32,6 +32,10 @@ class DemonstrationFileError(ValueError):
     """A file of demonstrations is not what it should be."""
 
 
+class _ModelInsteadError(Exception):
+    """A file holds a model."""
+
+
 @dataclass(frozen=True, eq=False)
 class DemonstrationFile:
     """What a file holds."""
@@ -120,6 +124,11 @@ def demonstrations_from_bytes(content: bytes, name: str) -> DemonstrationFile:
     try:
         header, arrays = _unpacked(content)
         return _checked(header, arrays)
+    except _ModelInsteadError:
+        raise DemonstrationFileError(
+            f"Expected {name} to be a file of demonstrations, got one that holds a model: give the "
+            "demonstrations, which `iflow-gym import` wrote."
+        ) from None
     except (
         safetensors.SafetensorError,
         ArithmeticError,
@@ -145,8 +154,9 @@ def _unpacked(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray[Any,
     length = int.from_bytes(content[:8], "little")
     metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
     if KEY not in metadata:
-        what = "a model" if "iflow_gym" in metadata else "other arrays"
-        raise ValueError(f"it holds {what}")
+        if "iflow_gym" in metadata:
+            raise _ModelInsteadError
+        raise ValueError("it holds other arrays")
     header = json.loads(metadata[KEY])
     if not isinstance(header, dict):
         raise ValueError(f"its header is {header!r:.60}")

@@ -122,20 +122,24 @@ def from_table(table: Mapping[str, Column], columns: Columns, name: str) -> Read
     plain = {n: _plain(n) for n in names}
     time = columns.time
     if time is not None:
-        _known(time, names, name)
+        time = _known(time, names, name)
     elif columns.dt is None:
         time = next((n for n in names if plain[n][0] in TIMES), None)
     group = columns.group
     if group is not None:
-        _known(group, names, name)
+        group = _known(group, names, name)
     else:
         group = next((n for n in names if plain[n][0] in GROUPS), None)
     taken = {time, group}
     speeds = columns.velocities
-    if speeds is None:
+    if speeds is not None:
+        speeds = tuple(_known(c, names, name) for c in speeds)
+    else:
         speeds = _guess(plain, taken, _SPEED_AXES, _SPEED_NUMBERED)
     positions = columns.positions
-    if positions is None:
+    if positions is not None:
+        positions = tuple(_known(c, names, name) for c in positions)
+    else:
         positions = _guess(plain, {*taken, *speeds}, _AXES, _NUMBERED)
     if not positions:
         left = [n for n in names if n not in {*taken, *speeds} and table[n].dtype.kind == "f"]
@@ -148,8 +152,6 @@ def from_table(table: Mapping[str, Column], columns: Columns, name: str) -> Read
     dropped_speeds: tuple[str, ...] = ()
     if columns.velocities is None and speeds and len(speeds) != len(positions):
         dropped_speeds, speeds = speeds, ()
-    for column in (*positions, *speeds):
-        _known(column, names, name)
     points = _numbers(table, positions, name)
     moving = _numbers(table, speeds, name) if speeds else None
     if moving is not None and moving.shape != points.shape:
@@ -375,7 +377,7 @@ def _named(
     candidates = [f"{k}{suffix}" for k in said or known] + list(said or ())
     found = next((lowered[c.lower()] for c in candidates if c.lower() in lowered), None)
     if said and found is None:
-        _known(said[0], list(numbers), name)
+        found = _known(said[0], list(numbers), name)
     if found is None and suffix:  # times that all recordings share
         found = next((lowered[k] for k in known if k in lowered), None)
     return found
@@ -410,13 +412,18 @@ def _guess(
     return ()
 
 
-def _known(column: str, names: Sequence[str], where: str) -> None:
+def _known(column: str, names: Sequence[str], where: str) -> str:
+    """Return the column of a name, with its unit or without; raise RecordingError if none is."""
     if column not in names:
+        plain = [n for n in names if _plain(n)[0] == column.lower()]
+        if len(plain) == 1:
+            return plain[0]
         near = difflib.get_close_matches(column, names, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise RecordingError(
             f"Expected a column {column!r} in {where}, got {', '.join(names[:20])}.{hint}"
         )
+    return column
 
 
 def _numbers(table: Mapping[str, Column], names: Sequence[str], where: str) -> FloatArray:

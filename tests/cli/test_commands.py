@@ -143,7 +143,7 @@ def test_what_is_not_understood_is_2_and_says_why(call, arguments, message):
         (["score", "absent", "angle.safetensors"], "absent"),
         (["score", "reach.csv", "angle.safetensors"], "model file"),
         (["score", "angle.safetensors", "angle.safetensors"], "got demonstrations"),
-        (["fit", "linear.safetensors", "-o", "m"], "it holds a model"),
+        (["fit", "linear.safetensors", "-o", "m"], "holds a model"),
         (["fit", "angle.safetensors", "-o", "m", "--method", "orbit-field"], "repeat"),
     ],
 )

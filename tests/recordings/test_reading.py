@@ -161,6 +161,10 @@ def test_what_was_taken_for_what_is_said():
         "group": None,
         "left_out": ["pressure"],
     }
+    (recording,) = read(
+        text(TABLE).replace(b",x,y,", b",x (mm),y (mm),"), "csv", Columns(positions=("y", "x"))
+    ).recordings
+    np.testing.assert_allclose(recording.positions, P[:, ::-1])
     headed = text(TABLE).replace(b",x,y,", b",x (mm),y (mm),")
     assert read(headed, "csv").unit == "mm"
 
