@@ -5,6 +5,9 @@ Any change that may change a score bumps an id's version.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
+
 import gymnasium
 
 from iflow_gym.datasets.lasa import SHAPES
@@ -46,6 +49,32 @@ def register_all() -> None:
             _register(env_id, f"letters:{name}Env", f"letters:{name}VectorEnv", letter=letter)
     _register(DRUMMING_ID, "drumming.env:DrummingEnv")
     _register(DRUMMING_RECORDED_ID, "drumming.recorded:DrummingRecordedEnv")
+
+
+def registered_ids() -> list[str]:
+    """Return the ids of the suite's environments, in the order of their registration."""
+    return [i for i in gymnasium.registry if i.startswith("iflow/")]
+
+
+def matching_ids(patterns: Iterable[str], ids: Sequence[str]) -> list[str]:
+    """Return those of some ids that globs match, over ``iflow/LASA-Angle-v0``, ``LASA-Angle-v0`` or
+    ``LASA-Angle``.
+
+    Raises
+    ------
+    UnknownNameError
+        For a pattern that matches none.
+    """
+    from iflow_gym.baselines.registry import unknown
+
+    names = {i: (i, i.partition("/")[2], i.partition("/")[2].rpartition("-v")[0]) for i in ids}
+    chosen: dict[str, None] = {}
+    for pattern in patterns:
+        found = [i for i, known in names.items() if any(fnmatchcase(n, pattern) for n in known)]
+        if not found:
+            raise unknown("environment", pattern, [short for _, short, _ in names.values()])
+        chosen |= dict.fromkeys(found)
+    return list(chosen)
 
 
 def _register(

@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from iflow_gym.demonstration_files import KEY as DEMONSTRATIONS
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.model_files import SCHEMA_VERSION, ModelFileError
 from iflow_gym.primitive import MovementPrimitive
@@ -46,8 +47,12 @@ N_CORNERS = 64
 PROBE_STEPS = 10
 """Steps of a movement primitive that is probed; it is told of a tenth of its duration each."""
 
+FIT_KEY = "iflow_gym_fit"
+"""Of the record of a fit, in a file's metadata."""
+
 _WRONG = (
     ArithmeticError,
+    AssertionError,
     AttributeError,
     LookupError,
     MemoryError,
@@ -55,7 +60,7 @@ _WRONG = (
     TypeError,
     ValueError,
 )
-"""What evaluating a model may raise whose settings or numbers are absurd."""
+"""What loading or evaluating a model may raise whose settings or numbers are absurd."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,8 @@ class ModelInfo:
     """Of the arrays by name."""
     n_bytes: int
     """Length of the file."""
+    fit: dict[str, Any] | None = None
+    """What was said of its fit (`fit_records`), if anything: anyone's word, too."""
 
     @property
     def is_cycle(self) -> bool:
@@ -111,7 +118,7 @@ def inspect_model(path: str | os.PathLike[str], *, most_bytes: int = MOST_BYTES)
 def load_model(
     path: str | os.PathLike[str],
     *,
-    method: type[Any] | None = None,
+    method: type[Any] | str | None = None,
     demonstrations: Demonstrations | None = None,
     most_bytes: int = MOST_BYTES,
 ) -> Any:
@@ -122,8 +129,9 @@ def load_model(
     path
         The file.
     method
-        The class to load it with. By default the method of the registry that the file names; a name
-        that is none of them is never imported.
+        The class to load it with, or its name: a registered one, or ``"module:Class"``, which is
+        imported. By default the method of the registry that the file names; what the file names is
+        never imported.
     demonstrations
         What it is to be used on: a model of other dimensions or of the other kind of motion is
         refused, and so is one that is not finite in their bounding box. Without them it is
@@ -142,7 +150,13 @@ def load_model(
         If there is no such file.
     ModelFileError
         If it is anything but a whole model whose values are finite.
+    UnknownNameError
+        If the method is named and unknown.
     """
+    from iflow_gym.baselines.registry import load_method
+
+    if isinstance(method, str):
+        method = load_method(method)
     info = inspect_model(path, most_bytes=most_bytes)
     with _refusals(info.path):
         cls = _registered(info.method) if method is None else method
@@ -151,8 +165,14 @@ def load_model(
                 raise ValueError(f"expected at most {most} rows of {name!r}, got {shape[0]}")
         try:
             model = cls.load(info.path)
+        except ModelFileError:
+            raise
         except MemoryError as error:
             raise ValueError(f"loading it takes more memory than there is ({error})") from error
+        except _WRONG as error:
+            raise ValueError(
+                f"expected a whole {info.method!r} model, got {type(error).__name__}: {error}"
+            ) from error
         if isinstance(model, Method):
             _check_use(model, demonstrations)
             _check_finite(model, demonstrations)
@@ -192,12 +212,12 @@ def _inspected(path: Path, file: BinaryIO, n_bytes: int, most_bytes: int) -> Mod
     texts = listed.pop("__metadata__", {})
     text = texts.get("iflow_gym") if isinstance(texts, dict) else None
     if not isinstance(text, str):
-        raise ValueError(
-            "expected a header of iflow-gym in the safetensors file, got none: it is of another "
-            "program, or of the demonstrations and not of a model"
-        )
+        own = isinstance(texts, dict) and DEMONSTRATIONS in texts
+        what = "demonstrations" if own else "a file of another program"
+        raise ValueError(f"expected the header of a model of iflow-gym, got {what}")
     header = _as_object(text, "its header")
     _check_header(header)
+    fit = texts.get(FIT_KEY)
     shapes = _shapes(listed, n_bytes - 8 - length)
     return ModelInfo(
         path,
@@ -207,13 +227,14 @@ def _inspected(path: Path, file: BinaryIO, n_bytes: int, most_bytes: int) -> Mod
         header["schema_version"],
         shapes,
         n_bytes,
+        None if fit is None else _as_object(fit, "the record of its fit"),
     )
 
 
 def _as_object(text: bytes | str, what: str) -> dict[str, Any]:
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"expected {what} to be JSON, got {error}") from error
     if not isinstance(value, dict):
         raise ValueError(f"expected {what} to be a JSON object, got {type(value).__name__}")
@@ -278,7 +299,7 @@ def _registered(name: str) -> type[Method]:
     if name not in METHODS:
         raise ValueError(
             f"expected a method of the registry ({', '.join(METHODS)}), got {_short(name)}: pass "
-            "method=, the class that wrote it"
+            "method= (--method), the class that wrote it"
         )
     return load_method(name)
 

@@ -1,8 +1,6 @@
 """The leaderboard's page in a real browser: made of records that are made up, and looked at."""
 
 import itertools
-import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -15,20 +13,6 @@ from iflow_gym.system import Guarantee
 sync_api = pytest.importorskip(
     "playwright.sync_api", reason="the browser tests need playwright: pip install -e '.[test]'"
 )
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if path is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is installed")
-    sandbox = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=sandbox)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

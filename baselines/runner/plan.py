@@ -38,7 +38,7 @@ from iflow_gym.datasets.lasa import MULTI_MODELS
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.evaluate import motion_of
 from iflow_gym.metrics import Motion, metrics_hash
-from iflow_gym.registration import POINT_MASS_ID
+from iflow_gym.registration import POINT_MASS_ID, matching_ids, registered_ids
 from iflow_gym.results import ResultFileError, read_result, result_path, short_name
 from iflow_gym.system import Method
 
@@ -207,16 +207,8 @@ def _motions(method: type[Method]) -> tuple[Motion, ...]:
 
 def select_environments(patterns: Sequence[str]) -> list[str]:
     """Return ids of the suite's environments by globs over ids and short names."""
-    known = [
-        i for i in gymnasium.registry if i.startswith("iflow/") and i != POINT_MASS_ID
-    ]  # that one takes the caller's own demonstrations
-    chosen: dict[str, None] = {}
-    for pattern in patterns:
-        found = [i for i in known if fnmatchcase(i, pattern) or fnmatchcase(short_name(i), pattern)]
-        if not found:
-            raise unknown("environment", pattern, [short_name(i) for i in known])
-        chosen |= dict.fromkeys(found)
-    return list(chosen)
+    # PointMass takes the caller's own demonstrations.
+    return matching_ids(patterns, [i for i in registered_ids() if i != POINT_MASS_ID])
 
 
 def family(environment: str) -> str:

@@ -37,7 +37,7 @@ MODULES = {
         "iflow_gym.partial_fits",
         "iflow_gym.model_files",
         "iflow_gym.saved_models",
-        "iflow_gym.models",
+        "iflow_gym.fit_records",
         "iflow_gym.baselines.registry",
     ),
     "environments": (

@@ -207,15 +207,13 @@ class ExportMinari:
 
     def run(self) -> int:
         """Export."""
-        from iflow_gym.minari_datasets import (
-            chosen_environments,
-            dataset_id_of,
-            export_minari,
-        )
+        from iflow_gym.baselines.registry import UnknownNameError
+        from iflow_gym.minari_datasets import dataset_id_of, export_minari, exportable
+        from iflow_gym.registration import matching_ids
 
         try:
-            chosen = chosen_environments(self.patterns)
-        except ValueError as error:
+            chosen = matching_ids(self.patterns, exportable())
+        except UnknownNameError as error:
             raise UsageError(str(error)) from error
         if not chosen:
             raise UsageError("Expected environments to export, such as LASA-Angle, got none.")

@@ -53,27 +53,15 @@ class Envs:
 
     def run(self) -> int:
         """List them."""
-        from fnmatch import fnmatchcase
-
-        import gymnasium
-
-        import iflow_gym  # noqa: F401 (registers them)
+        from iflow_gym.baselines.registry import UnknownNameError
         from iflow_gym.cli.datasets import STATUSES, status_of
+        from iflow_gym.registration import matching_ids, register_all, registered_ids
 
-        ids = [i for i in gymnasium.registry if i.startswith("iflow/")]
-        chosen: dict[str, None] = {}
-        for pattern in self.patterns or ("*",):
-            found = [
-                i
-                for i in ids
-                if any(fnmatchcase(n, pattern) for n in (i, i[6:], i[6:].rpartition("-v")[0]))
-            ]
-            if not found:
-                raise UsageError(
-                    f"Expected environments that match {pattern!r}, got none: `iflow-gym envs` "
-                    "lists all."
-                )
-            chosen |= dict.fromkeys(found)
+        register_all()
+        try:
+            chosen = matching_ids(self.patterns or ("*",), registered_ids())
+        except UnknownNameError as error:
+            raise UsageError(str(error)) from error
         rows = []
         statuses = {name: status_of(name).state for name in STATUSES}
         for env_id in chosen:

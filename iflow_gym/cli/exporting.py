@@ -53,7 +53,7 @@ class Export:
         if export is None:
             raise UsageError(
                 f"Expected a model of imitation-flow, which has an ONNX graph, got one of "
-                f"{method.name}: run that in Python (iflow_gym.models.load_model)."
+                f"{method.name}: run that in Python (iflow_gym.saved_models.load_model)."
             )
         with output_path(self.output, ".onnx") as path:
             export(path, velocity=self.velocity)

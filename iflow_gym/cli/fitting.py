@@ -69,7 +69,7 @@ class Fit:
         import time
 
         from iflow_gym.cli.motions import load_method_class, load_motion
-        from iflow_gym.models import add_fit_record
+        from iflow_gym.fit_records import add_fit_record
 
         if self.json and self.output == PIPE:
             raise UsageError("Expected one thing for standard output, got the model and --json.")

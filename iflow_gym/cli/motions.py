@@ -81,9 +81,9 @@ def load_method_class(name: str) -> type[Method]:
 
 def load_model_file(path: str, method: str | None) -> tuple[Method, dict[str, object] | None]:
     """Return the model of a file or of ``-``, and what is known of its fit."""
-    from iflow_gym.models import fit_record, load_model
+    from iflow_gym.saved_models import inspect_model, load_model
 
     if method is not None:
         load_method_class(method)  # another name is the command's fault, not the file's
     with input_path(path) as file:
-        return load_model(file, method), fit_record(file)
+        return load_model(file, method=method), inspect_model(file).fit

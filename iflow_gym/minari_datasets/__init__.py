@@ -3,12 +3,10 @@
 Needs the extra ``minari``; datasets are written to the user's disk and are no part of the package.
 """
 
-from iflow_gym.minari_datasets.choice import chosen_environments, exportable
-from iflow_gym.minari_datasets.export import dataset_id_of, export_minari
+from iflow_gym.minari_datasets.export import dataset_id_of, export_minari, exportable
 from iflow_gym.minari_datasets.reading import read_minari
 
 __all__ = [
-    "chosen_environments",
     "dataset_id_of",
     "export_minari",
     "exportable",

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from iflow_gym.minari_datasets.provenance import NOT_EXPORTED, PROVENANCE, Provenance
 from iflow_gym.minari_datasets.store import KEY, datasets_root, the_minari
+from iflow_gym.registration import register_all, registered_ids
 
 VERSION = 0
 """Of the datasets: other transitions from the same recordings are another version."""
@@ -36,6 +37,13 @@ def dataset_id_of(env_id: str, control_mode: str = "velocity") -> str:
     provenance = _provenance(env_id)
     mode = "" if control_mode == "velocity" else f"-{control_mode}"
     return f"{re.sub(r'-v[0-9]+$', '', env_id)}/{provenance.name}{mode}-v{VERSION}"
+
+
+def exportable() -> list[str]:
+    """Return the ids of the environments that have demonstrations of their own."""
+    register_all()
+    families = tuple(f"iflow/{name}-" for name in PROVENANCE)
+    return [i for i in registered_ids() if i.startswith(families)]
 
 
 def export_minari(

@@ -17,7 +17,7 @@ from iflow_gym.cli.commands import COMMANDS
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstration_files import load_demonstrations, save_demonstrations
 from iflow_gym.demonstrations import Demonstrations
-from iflow_gym.models import fit_record, load_model
+from iflow_gym.saved_models import inspect_model, load_model
 
 CSV = "t,x (mm),y (mm),demo\n" + "\n".join(
     f"{k * 0.02:.3f},{100 * (1 - s):.4f},{50 * s**2:.4f},{d}"
@@ -186,7 +186,7 @@ def test_fit_writes_a_model_that_says_what_it_was_fitted_on(call, folder):
     assert told["settings"]["margin"] == 2.0
     model = load_model(folder / "again.safetensors")
     assert model.config.margin == 2.0
-    record = fit_record(folder / "again.safetensors")
+    record = inspect_model(folder / "again.safetensors").fit
     assert (record["protocol"], len(record["recordings"])) == ("reproduction", 7)
 
 

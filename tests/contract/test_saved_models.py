@@ -3,10 +3,13 @@
 The files are those of every registered method, changed at random and with intent.
 """
 
+import contextlib
 import functools
 import json
 import os
 import struct
+import sys
+import tracemalloc
 import warnings
 
 import numpy as np
@@ -15,11 +18,12 @@ import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from iflow_gym.baselines.registry import METHODS, load_method
+from iflow_gym.baselines.registry import METHODS, UnknownNameError, load_method
 from iflow_gym.baselines.runner.presets import load_settings
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.datasets.letters import load_letter
 from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.fit_records import add_fit_record
 from iflow_gym.model_files import ModelFileError, read_model_file
 from iflow_gym.saved_models import (
     MOST_BYTES,
@@ -188,6 +192,29 @@ def test_probes_are_in_the_box_with_its_corners_the_starts_and_the_goal():
     np.testing.assert_array_equal(found[-4:-1], motion.starts)
     np.testing.assert_array_equal(found[-1], motion.goal)
     np.testing.assert_array_equal(found, probes(motion))
+
+
+@every_method
+def test_a_file_keeps_what_is_said_of_its_fit(name, saved, tmp_path):
+    path = tmp_path / "model"
+    path.write_bytes(saved[0].read_bytes())
+    assert inspect_model(path).fit is None
+    add_fit_record(path, {"protocol": "reproduction", "recordings": ["a"]})
+    assert inspect_model(path).fit == {"protocol": "reproduction", "recordings": ["a"]}
+    for key, array in load_model(path)._arrays().items():
+        np.testing.assert_array_equal(array, fitted(name)._arrays()[key])
+
+
+def test_only_who_loads_names_a_module(tmp_path, monkeypatch):
+    (tmp_path / "evil.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "model"
+    path.write_bytes(raw({**head(method="evil:Method"), **GOAL}, bytes(16)))
+    with pytest.raises(ModelFileError, match="method="):
+        load_model(path)
+    assert "evil" not in sys.modules
+    with pytest.raises(UnknownNameError):
+        load_model(path, method="no_such_module:Method")
 
 
 # Files changed at random ------------------------------------------------------------------------
@@ -380,6 +407,22 @@ def test_a_small_file_that_asks_for_a_huge_matrix_is_refused(name, saved, tmp_pa
     path = written(tmp_path / "model", header, many)
     with pytest.raises(ModelFileError, match=f"at most {most} rows of '{key}', got"):
         load_model(path)
+
+
+@every_method
+def test_settings_that_claim_gigabytes_take_none(name, saved, tmp_path):
+    path, header, arrays = saved
+    load_model(path)  # what is imported is no memory of the file's
+    for key, value in header["config"].items():
+        for huge in (10**7, 10**12) if type(value) is int else ():
+            config = header["config"] | {key: huge}
+            written(tmp_path / "model", {**header, "config": config}, arrays)
+            tracemalloc.start()
+            with contextlib.suppress(ModelFileError):
+                load_model(tmp_path / "model")
+            peak = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+            assert peak < 50e6, key
 
 
 def test_a_load_that_runs_out_of_memory_says_so(tmp_path):

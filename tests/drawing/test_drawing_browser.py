@@ -1,8 +1,6 @@
 """The page in a real browser: motions are drawn, fitted, looked at, pushed and saved."""
 
-import os
 import re
-import shutil
 import time
 from pathlib import Path
 
@@ -16,25 +14,12 @@ sync_api = pytest.importorskip(
     "playwright.sync_api", reason="the browser tests need playwright: pip install -e '.[test]'"
 )
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CONTRASTS = (Path(__file__).parents[1] / "contrasts.js").read_text(encoding="utf-8")
 REFUSED = ("responded with a status of 422", "responded with a status of 500")
 """What the browser's console says where the server refuses a drawing, or fails."""
 
 PATIENCE = 120_000
 """Milliseconds that a busy machine is given for what takes one or two."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if path is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is installed")
-    sandbox = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=sandbox)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
