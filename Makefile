@@ -14,7 +14,7 @@ STAMP := $(VENV)/.installed
 
 help:
 	@echo "make leaderboard   fit the baselines on LASA, score them, write leaderboard/LEADERBOARD.md"
-	@echo "                   (PRESET=smoke|standard|full, default standard: half an hour on two cores)"
+	@echo "                   (PRESET=smoke|standard|full, default standard; what is up to date is not done again)"
 	@echo "make check         check leaderboard/results: records, hashes, the board that they make"
 	@echo "make test          run the tests, the linter and the type checker"
 	@echo "make wheel         build the wheel, install it into an empty environment, try it there"
