@@ -31,7 +31,7 @@ def test_example_runs_and_draws(script, tmp_path):
         env=os.environ | settings | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0, done.stderr
