@@ -59,35 +59,37 @@ def _json(value: Any) -> Any:
 
 
 @contextmanager
-def progress(text: str) -> Iterator[None]:
-    """Show on a terminal's standard error that something goes on, and for how long.
+def progress(
+    text: str, total: int | None = None, what: str = ""
+) -> Iterator[Callable[[int], None]]:
+    """Show on a terminal's standard error how far something is, and for how long it has gone on.
 
-    For what cannot say how far it is.
+    The function that comes is told how many of the total are done. Without a total, and while
+    something goes on after the last of them, the bar moves to and fro.
     """
     if not sys.stderr.isatty():
-        yield
+        yield lambda done: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
+    counts = TextColumn("{task.fields[counts]}")
+    columns = [TextColumn("{task.description}"), BarColumn(), counts, TimeElapsedColumn()]
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        bar.add_task(text, total=None)
-        yield
+        task = bar.add_task(text, total=total, counts="")
 
+        def told(done: int) -> None:
+            if total is None or bar.tasks[0].finished:
+                return
+            bar.update(task, completed=min(done, total))
+            seconds = bar.tasks[0].time_remaining
+            left = "" if seconds is None else f", {seconds:.0f} s left"
+            counts = f"{done / total:.0%}, {done} of {total} {what}".rstrip() + left
+            bar.update(task, counts=counts, visible=done < total, refresh=True)
+            if done >= total:
+                bar.add_task(f"{text}: finishing", total=None, counts="")
 
-@contextmanager
-def counted(text: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a bar on a terminal's standard error; the function that comes counts one step."""
-    if not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(text, total=total)
-        yield lambda: bar.advance(task)
+        yield told
 
 
 # Files ----------------------------------------------------------------------------------------

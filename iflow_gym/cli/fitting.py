@@ -14,6 +14,7 @@ from typing import (
     Any,
     Literal,
     Union,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
@@ -70,6 +71,7 @@ class Fit:
 
         from iflow_gym.cli.motions import load_method_class, load_motion
         from iflow_gym.fit_records import add_fit_record
+        from iflow_gym.watched_training import WatchedGenerator, training_steps
 
         if self.json and self.output == PIPE:
             raise UsageError("Expected one thing for standard output, got the model and --json.")
@@ -79,8 +81,11 @@ class Fit:
         demonstrations = demonstrations.split(self.protocol).fit
         with output_path(self.output, ".safetensors") as path:
             wall, cpu = time.perf_counter(), time.process_time()
-            with progress(f"Fitting {method.title}"):
-                method.fit(demonstrations, seed=self.seed)
+            steps = training_steps(method, demonstrations)
+            with progress(f"Fitting {method.title}", steps, "steps") as told:
+                # What is random in a fit is the seed's, and the generator says how far it is.
+                seed = self.seed if steps is None else WatchedGenerator(self.seed, told)
+                method.fit(demonstrations, seed=cast(int, seed))
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             method.save(path)
             record = {

@@ -356,6 +356,26 @@ def test_data_says_where_and_verifies(call, monkeypatch, tmp_path):
     assert (status, "30 of 30" in output) == (0, True)
 
 
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_on_a_terminal_a_fit_says_how_many_of_its_steps_are_done(call, folder, monkeypatch):
+    """And it is the fit that it is without one."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    arguments = ("fit", "angle.safetensors", "--set", "n_steps=80", "-o")
+    assert call(*arguments, "plain.safetensors")[0] == 0
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    assert call(*arguments, "watched.safetensors")[0] == 0
+    for text in ("80%, 64 of 80 steps", "Fitting ImitationFlow: finishing"):
+        assert text in terminal.getvalue()
+    plain, watched = (load_model(folder / f"{n}.safetensors") for n in ("plain", "watched"))
+    states = load_demonstrations(folder / "angle.safetensors").starts
+    np.testing.assert_array_equal(plain.velocity(states), watched.velocity(states))
+
+
 # Pipes --------------------------------------------------------------------------------------
 
 
