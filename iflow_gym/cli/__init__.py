@@ -8,6 +8,7 @@ and completion come at once.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from typing import TYPE_CHECKING, NoReturn
 
@@ -77,6 +78,8 @@ def _told(error: BaseException, status: int) -> int:
         raise error
     text = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        text = f"{error.filename}: {error.strerror}."
+        # What is written is complete under another name first.
+        name = re.sub(r"\.\d+\.partial", "", str(error.filename))
+        text = f"Expected to read or write {name}, got: {error.strerror}. Look at the path."
     complain(text)
     return status

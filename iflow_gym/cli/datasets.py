@@ -218,6 +218,8 @@ class ExportMinari:
                 f"{error} Those without demonstrations of their own, PointMass and Disturbed, are "
                 "not exported."
             ) from error
+        if self.folder is not None and self.folder.exists() and not self.folder.is_dir():
+            raise UsageError(f"Expected a folder for datasets at {self.folder}, got a file.")
         if not chosen:
             raise UsageError("Expected environments to export, such as LASA-Angle, got none.")
         with progress("Exporting", len(chosen), "datasets") as told:

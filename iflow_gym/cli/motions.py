@@ -66,10 +66,20 @@ def load_method_class(name: str) -> type[Method]:
     """Return the class of a registered method or of ``module:Class``; UsageError for neither."""
     from iflow_gym.baselines.registry import UnknownNameError, load_method
 
+    module, colon, cls = name.partition(":")
+    if colon and not (cls.isidentifier() and all(p.isidentifier() for p in module.split("."))):
+        raise UsageError(
+            f"Expected a method module:Class, such as my_module:MyMethod, got {name!r}."
+        )
     try:
         return load_method(name)
     except UnknownNameError as error:
         raise UsageError(str(error)) from error
+    except Exception as error:  # whatever one's own module does when it is imported
+        raise UsageError(
+            f"Expected {module} to be importable, got {type(error).__name__}: {error}. "
+            "IFLOW_GYM_DEBUG=1 shows where."
+        ) from error
 
 
 def load_model_file(path: str, method: str | None) -> tuple[Method, dict[str, object] | None]:
@@ -78,5 +88,9 @@ def load_model_file(path: str, method: str | None) -> tuple[Method, dict[str, ob
 
     if method is not None:
         load_method_class(method)  # another name is the command's fault, not the file's
+    if path != PIPE and not Path(path).exists():
+        raise FileNotFoundError(
+            f"Expected a model at {path}, which `iflow-gym fit` wrote, got none."
+        )
     with input_path(path) as file:
         return load_model(file, method=method), inspect_model(file).fit

@@ -31,6 +31,7 @@ def folder(tmp_path_factory):
     """A folder with a recording, demonstrations and models of them."""
     path = tmp_path_factory.mktemp("cli")
     (path / "reach.csv").write_text(CSV)
+    (path / "broken.py").write_text("1 / 0\n")
     motion = load_lasa("Angle")
     thin = Demonstrations.from_arrays(
         [p[::-1][::20][::-1] for p in motion.positions],
@@ -129,6 +130,28 @@ def test_completion_knows_the_commands(call):
         (["plot", "angle.safetensors", "-o", "a.png", "--grid", "4"], "--model"),
         (["export", "linear.safetensors", "-o", "a.onnx"], "imitation-flow"),
         (["score", "-", "-"], "one of the inputs"),
+        (["import", "reach.csv", "-o", "reach.csv"], "which is one of them"),
+        (["import", "reach.csv", "-o", "a", "--plot", "a.gif"], ".png"),
+        (["import", "reach.csv", "-o", "a", "--format", "xyz"], "csv, npz"),
+        (["fit", "angle.safetensors", "-o", "angle.safetensors"], "which is one of them"),
+        (["fit", "angle.safetensors", "-o", ""], "an empty name"),
+        (["fit", "angle.safetensors", "-o", "m", "--seed", "-1"], "seed >= 0"),
+        (["fit", "angle.safetensors", "-o", "m", "--preset", "fast"], "smoke, standard or full"),
+        (["fit", "angle.safetensors", "-o", "m", "--method", ".:"], "module:Class"),
+        (["fit", "angle.safetensors", "-o", "m", "--method", "broken:Mine"], "ZeroDivisionError"),
+        (
+            ["fit", "angle.safetensors", "-o", "m", "--method", "bc", "--set", "decays=['a']"],
+            "each a number",
+        ),
+        (["score", "linear.safetensors", "angle.safetensors", "--seed", "-1"], "seed >= 0"),
+        (["plot", "angle.safetensors", "-o", "a.png", "--method", "linear"], "--model"),
+        (["rollout", "linear.safetensors", "--starts", "absent"], "absent, got none"),
+        (
+            ["rollout", "linear.safetensors", "--motion", "angle.safetensors", "--dt", "0"],
+            "time step > 0",
+        ),
+        (["export", "linear.safetensors", "-o", "no/a.onnx"], "Expected a folder"),
+        (["data", "export-minari", "LASA-Angle", "--folder", "reach.csv"], "got a file"),
     ],
 )
 def test_what_is_not_understood_is_2_and_says_why(call, arguments, message):
@@ -145,7 +168,10 @@ def test_what_is_not_understood_is_2_and_says_why(call, arguments, message):
         (["import", "absent.csv", "-o", "a"], "absent.csv"),
         (["import", "reach.csv", "-o", "a", "--time", "stamp"], "'stamp'"),
         (["fit", "reach.csv", "-o", "m"], "iflow-gym import"),
-        (["score", "absent", "angle.safetensors"], "absent"),
+        (["score", "absent", "angle.safetensors"], "Expected a model at absent"),
+        (["fit", "angle.safetensors", "-o", "m", "--set", "device=tpu"], "could not be fitted"),
+        (["draw", "--no-open", "--port", "70000"], "from 0 to 65535"),
+        (["draw", "--no-open", "--directory", "reach.csv"], "a folder for drawings"),
         (["score", "reach.csv", "angle.safetensors"], "model file"),
         (["score", "angle.safetensors", "angle.safetensors"], "got demonstrations"),
         (["fit", "linear.safetensors", "-o", "m"], "holds a model"),
@@ -183,7 +209,7 @@ def test_import_reports_draws_and_writes(call, folder):
 def test_fit_writes_a_model_that_says_what_it_was_fitted_on(call, folder):
     status, output, said = call(
         "fit", "angle.safetensors", "-o", "again.safetensors", "--method", "linear",
-        "--set", "margin=2", "--json",
+        "--set", "margin=2", "--set", "noise_horizons=[1, 5]", "--json",
     )  # fmt: skip
     assert status == 0
     assert "Stability: proved." in said
@@ -191,6 +217,7 @@ def test_fit_writes_a_model_that_says_what_it_was_fitted_on(call, folder):
     assert told["settings"]["margin"] == 2.0
     model = load_model(folder / "again.safetensors")
     assert model.config.margin == 2.0
+    assert repr(model.config.noise_horizons) == "(1, 5)"
     record = inspect_model(folder / "again.safetensors").fit
     assert (record["protocol"], len(record["recordings"])) == ("reproduction", 7)
 
