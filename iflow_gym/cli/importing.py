@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -21,7 +21,7 @@ from iflow_gym.cli.console import (
 )
 from iflow_gym.recordings import CleanUp, Columns
 from iflow_gym.recordings.columns import shown
-from iflow_gym.recordings.reading import FORMATS, Format
+from iflow_gym.recordings.reading import FORMATS
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Import:
         options = self.clean_up
         if options.name == CleanUp.name and self.output != PIPE:
             options = replace(options, name=Path(self.output).name.partition(".")[0])
-        reading = read_recordings(sources, self.columns, format=cast(Format | None, self.format))
+        reading = read_recordings(sources, self.columns, format=self.format)
         named = ", ".join(Path(s.name).name if s.path else s.name for s in sources)
         cleaned = clean(reading, options, source=named)
         for note in cleaned.notes:
