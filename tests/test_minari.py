@@ -1,21 +1,27 @@
 """Minari datasets: what goes out is real transitions, what comes in is what it is said to be."""
 
+import contextlib
 import hashlib
 import io
 import json
+import os
+import shutil
 import sys
 import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import iflow_gym.datasets.recorded as recorded
 from iflow_gym import minari_datasets
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.minari_datasets import dataset_id_of, export, export_minari, read_minari
 from iflow_gym.minari_datasets.provenance import NOT_EXPORTED, PROVENANCE
-from iflow_gym.minari_datasets.store import ROOT_VARIABLE, datasets_root
+from iflow_gym.minari_datasets.store import ROOT_VARIABLE, DatasetError, datasets_root
+from iflow_gym.recordings import CleanUp, RecordingError, clean, read_recordings
 
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
@@ -392,3 +398,154 @@ def test_what_the_caller_says_counts_more_than_what_the_dataset_says(angle, root
 def test_metadata_are_plain_json(angle, root):
     text = (root / angle / "data/metadata.json").read_text()
     assert json.loads(text)["iflow_gym"]["goal"] == [0.0, 0.0]
+
+
+# Damage -----------------------------------------------------------------------------------------
+
+LINE = "iflow/LASA-Line/human-v0"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of a small dataset."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "_episodes", moving)
+        export_minari("iflow/LASA-Line-v0", root=folder)
+    return folder
+
+
+def moving(env):
+    """A straight line of 20 samples for each recording."""
+    for episode in one_episode(env):
+        n = 20
+        last = np.arange(n - 1) == n - 2
+        yield episode | {
+            "observations": np.linspace([40.0, 20.0], [0.0, 0.0], n),
+            "actions": np.zeros((n - 1, 2), np.float32),
+            "rewards": np.zeros(n - 1),
+            "terminations": np.zeros(n - 1, bool),
+            "truncations": last,
+            "infos": {"time": 0.1 * np.arange(n)},
+        }
+
+
+@pytest.fixture
+def damaged(whole, tmp_path, monkeypatch):
+    """A copy to damage: its root and the folder of its data."""
+    root = tmp_path / "root"
+    shutil.copytree(whole, root)
+    monkeypatch.setenv(ROOT_VARIABLE, str(root))
+    return root, root / LINE / "data"
+
+
+def read_both_ways(root):
+    """Read a dataset as both readers do; return their clear errors."""
+    errors = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            read_minari(LINE, root=root)
+        except ValueError as error:
+            errors.append(str(error))
+        try:
+            clean(read_recordings([LINE]), CleanUp(unit="mm", trim=False))
+        except RecordingError as error:
+            errors.append(str(error))
+    return errors
+
+
+def with_metadata(**changes):
+    def change(data):
+        file = data / "metadata.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+    return change
+
+
+def with_observations(make):
+    def change(data):
+        import h5py
+
+        with h5py.File(data / "main_data.hdf5", "a") as file:
+            del file["episode_0/observations"]
+            make(file["episode_0"])
+
+    return change
+
+
+def claiming_terabytes(group):
+    group.create_dataset("observations", shape=(10**12, 2), chunks=(1000, 2), dtype="f8")
+
+
+DAMAGE = {
+    "no arrays": (lambda data: (data / "main_data.hdf5").unlink(), "No data found"),
+    "empty arrays": (lambda data: (data / "main_data.hdf5").write_bytes(b""), "signature"),
+    "cut arrays": (lambda data: os.truncate(data / "main_data.hdf5", 5000), "truncated"),
+    "no metadata": (lambda data: (data / "metadata.json").unlink(), "metadata.json"),
+    "no JSON": (lambda data: (data / "metadata.json").write_text("x"), "damaged"),
+    "deep JSON": (lambda data: (data / "metadata.json").write_text("[" * 100_000), "damaged"),
+    "a list": (lambda data: (data / "metadata.json").write_text("[]"), "its metadata are a list"),
+    "of another program": (lambda data: (data / "metadata.json").write_text("{}"), "None episodes"),
+    "too many episodes": (with_metadata(total_episodes=10**9), "1000000000 episodes"),
+    "an unknown space": (with_metadata(observation_space="{}"), "damaged"),
+    "no observations": (with_observations(lambda group: None), "observations"),
+    "a group": (with_observations(lambda group: group.create_group("observations")), "damaged"),
+    "terabytes": (with_observations(claiming_terabytes), "512 are read"),
+    "nan": (
+        with_observations(
+            lambda g: g.create_dataset("observations", data=np.full((20, 2), np.nan))
+        ),
+        "NaN",
+    ),
+    "words": (with_observations(lambda g: g.create_dataset("observations", data="a")), "numbers"),
+    "complex": (
+        with_observations(
+            lambda g: g.create_dataset("observations", data=np.ones((20, 2), complex))
+        ),
+        "numbers",
+    ),
+}
+
+
+def test_what_is_damaged_below_can_be_read_when_it_is_whole(damaged):
+    assert read_both_ways(damaged[0]) == []
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_dataset_is_told(name, damaged):
+    root, data = damaged
+    damage, message = DAMAGE[name]
+    damage(data)
+    errors = read_both_ways(root)
+    assert len(errors) == 2
+    assert all(e.startswith("Expected") and message in e for e in errors), errors
+
+
+@pytest.mark.parametrize(
+    "said", [None, [], "x", {"n_dims": "two"}, {"n_dims": 10**9}, {"goal": "x"}, {"name": 3}]
+)
+def test_what_export_said_is_looked_at(said, damaged):
+    with_metadata(iflow_gym=said)(damaged[1])
+    with pytest.raises(DatasetError, match="Export or download it again"):
+        read_minari(LINE, root=damaged[0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_a_dataset_with_other_bytes_gives_recordings_or_the_clear_error(data, whole):
+    name = data.draw(st.sampled_from(["main_data.hdf5", "metadata.json"]))
+    file = whole / LINE / "data" / name
+    before = file.read_bytes()
+    content = bytearray(before)
+    for _ in range(data.draw(st.integers(1, 6))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at] = data.draw(st.integers(0, 255))
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(0, len(content) - 1)) :]
+    file.write_bytes(content)
+    try:
+        with datasets_root(whole), contextlib.suppress(ImportError):  # another format's package
+            read_both_ways(whole)
+    finally:
+        file.write_bytes(before)

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, subcommand
+from tyro.conf import Positional, arg, subcommand
 
 from iflow_gym.baselines.run_all import RunOptions
+from iflow_gym.recordings.columns import shown
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Check:
     """Folder of a method, with its method.toml, or a folder of such folders."""
     cells: int = 3
     """Cells that are scored again; 0 looks at files alone."""
-    seed: int | None = None
+    seed: Annotated[int | None, shown("SEED")] = None
     """Seed by which they are chosen; by default one that nobody can foresee."""
     trust: bool = False
     """Import and run classes from outside the suite, which have your rights then."""
@@ -39,9 +40,9 @@ class Check:
 class Compare:
     """Print, as Markdown, what changed between two folders of results."""
 
-    before: Positional[Path]
+    before: Annotated[Positional[Path], arg(metavar="BEFORE")]
     """Folder of results."""
-    after: Positional[Path]
+    after: Annotated[Positional[Path], arg(metavar="AFTER")]
     """Folder of results."""
 
     def run(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Union
 
 import tyro
-from tyro.conf import OmitSubcommandPrefixes, subcommand
+from tyro.conf import DisallowNone, OmitSubcommandPrefixes, subcommand
 
 from iflow_gym.cli.board import Leaderboard
 from iflow_gym.cli.console import Command
@@ -44,7 +44,7 @@ def parse(arguments: list[str], description: str) -> Command:
             COMMANDS[name],
             prog=f"iflow-gym {name}",
             args=arguments[1:],
-            config=(OmitSubcommandPrefixes,),
+            config=(OmitSubcommandPrefixes, DisallowNone),
             use_underscores=False,
         )
         return command
@@ -57,7 +57,7 @@ def parse(arguments: list[str], description: str) -> Command:
         prog="iflow-gym",
         description=description,
         args=arguments,
-        config=(OmitSubcommandPrefixes,),
+        config=(OmitSubcommandPrefixes, DisallowNone),
         use_underscores=False,
     )
     return command

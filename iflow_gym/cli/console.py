@@ -59,35 +59,37 @@ def _json(value: Any) -> Any:
 
 
 @contextmanager
-def progress(text: str) -> Iterator[None]:
-    """Show on a terminal's standard error that something goes on, and for how long.
+def progress(
+    text: str, total: int | None = None, what: str = ""
+) -> Iterator[Callable[[int], None]]:
+    """Show on a terminal's standard error how far something is, and for how long it has gone on.
 
-    For what cannot say how far it is.
+    The function that comes is told how many of the total are done. Without a total, and while
+    something goes on after the last of them, the bar moves to and fro.
     """
     if not sys.stderr.isatty():
-        yield
+        yield lambda done: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
+    counts = TextColumn("{task.fields[counts]}")
+    columns = [TextColumn("{task.description}"), BarColumn(), counts, TimeElapsedColumn()]
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        bar.add_task(text, total=None)
-        yield
+        task = bar.add_task(text, total=total, counts="")
 
+        def told(done: int) -> None:
+            if total is None or bar.tasks[0].finished:
+                return
+            bar.update(task, completed=min(done, total))
+            seconds = bar.tasks[0].time_remaining
+            left = "" if seconds is None else f", {seconds:.0f} s left"
+            counts = f"{done / total:.0%}, {done} of {total} {what}".rstrip() + left
+            bar.update(task, counts=counts, visible=done < total, refresh=True)
+            if done >= total:
+                bar.add_task(f"{text}: finishing", total=None, counts="")
 
-@contextmanager
-def counted(text: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a bar on a terminal's standard error; the function that comes counts one step."""
-    if not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(text, total=total)
-        yield lambda: bar.advance(task)
+        yield told
 
 
 # Files ----------------------------------------------------------------------------------------
@@ -107,31 +109,52 @@ def input_path(path: str) -> Iterator[Path]:
 
 def input_bytes() -> bytes:
     """Return standard input."""
-    if sys.stdin.isatty():
-        raise UsageError("Expected a file on standard input (-), got a terminal.")
+    if sys.stdin is None or sys.stdin.isatty():
+        came = "a closed one" if sys.stdin is None else "a terminal"
+        raise UsageError(f"Expected a file on standard input (-), got {came}.")
     return sys.stdin.buffer.read()
+
+
+def check_output(path: str, *inputs: str) -> None:
+    """Raise UsageError for what cannot be written to, or is one of the inputs."""
+    target = Path(path)
+    if path == PIPE:
+        if sys.stdout.isatty():
+            raise UsageError("Expected a pipe or a file for what is no text (-), got a terminal.")
+    elif not path or target.is_dir():
+        came = "a folder" if path else "an empty name"
+        raise UsageError(f"Expected a file to write at {path!r}, got {came}.")
+    elif not target.parent.is_dir():
+        raise UsageError(
+            f"Expected a folder at {target.parent} to write {target.name} into, got none: make it."
+        )
+    elif not os.access(target.parent, os.W_OK):
+        raise UsageError(
+            f"Expected a folder that may be written to at {target.parent}, got one that may not: "
+            "write elsewhere."
+        )
+    elif any(target.exists() and Path(i).exists() and target.samefile(i) for i in inputs):
+        raise UsageError(f"Expected an output beside the inputs, got {path}, which is one of them.")
 
 
 @contextmanager
 def output_path(path: str, suffix: str = "") -> Iterator[Path]:
     """Give a path to write to; what is written for ``-`` goes to standard output afterwards."""
+    check_output(path)
     if path != PIPE:
-        target = Path(path)
-        if target.is_dir():
-            raise UsageError(f"Expected a file to write at {path}, got a folder.")
-        if not target.parent.is_dir():
-            raise UsageError(
-                f"Expected a folder at {target.parent} to write {target.name} into, got none."
-            )
-        yield target
+        yield Path(path)
         return
-    if sys.stdout.isatty():
-        raise UsageError("Expected a pipe or a file for what is no text (-), got a terminal.")
     with tempfile.TemporaryDirectory(prefix="iflow-gym-") as folder:
         target = Path(folder) / f"stdout{suffix}"
         yield target
         sys.stdout.buffer.write(target.read_bytes())
         sys.stdout.buffer.flush()
+
+
+def check_seed(seed: int) -> None:
+    """Raise UsageError for what is no seed."""
+    if seed < 0:
+        raise UsageError(f"Expected a seed >= 0 (--seed), got {seed}.")
 
 
 def only_one_pipe(*paths: str) -> None:
@@ -140,12 +163,20 @@ def only_one_pipe(*paths: str) -> None:
         raise UsageError("Expected one of the inputs on standard input (-), got several.")
 
 
+PICTURES = (".png", ".svg", ".pdf")
+
+
+def check_picture(path: str) -> None:
+    """Raise UsageError for what no picture can be written to."""
+    if path != PIPE and Path(path).suffix.lower() not in PICTURES:
+        raise UsageError(f"Expected a picture ending in {', '.join(PICTURES)}, got {path}.")
+    check_output(path)
+
+
 def save_picture(figure: Any, path: str) -> None:
     """Write a matplotlib figure; ``-`` is a PNG on standard output."""
+    check_picture(path)
     suffix = ".png" if path == PIPE else Path(path).suffix.lower()
-    known = (".png", ".svg", ".pdf")
-    if suffix not in known:
-        raise UsageError(f"Expected a picture ending in {', '.join(known)}, got {path}.")
     with output_path(path, suffix) as target:
         partial = target.with_name(f"{target.stem}.{os.getpid()}.partial{suffix}")
         figure.savefig(partial, dpi=150)

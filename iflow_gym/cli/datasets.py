@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, subcommand
 
-from iflow_gym.cli.console import UsageError, counted, print_json, say
+from iflow_gym.cli.console import UsageError, print_json, progress, say
 from iflow_gym.recordings.columns import shown
 
 
@@ -145,14 +145,14 @@ class Verify:
         chosen = self.names or tuple(n for n in STATUSES if status_of(n).state != "not here")
         checks = [(name, *check) for name in _names(chosen) for check in _checks(name)]
         rows: list[dict[str, Any]] = []
-        with counted("Checking", len(checks)) as advance:
-            for name, item, load in checks:
+        with progress("Checking", len(checks), "recordings") as told:
+            for done, (name, item, load) in enumerate(checks, start=1):
                 try:
                     load()
                     rows.append({"data": name, "item": item, "ok": True, "error": None})
                 except (OSError, ValueError) as error:
                     rows.append({"data": name, "item": item, "ok": False, "error": str(error)})
-                advance()
+                told(done)
         bad = [r for r in rows if not r["ok"]]
         if self.json:
             print_json(rows)
@@ -214,14 +214,19 @@ class ExportMinari:
         try:
             chosen = matching_ids(self.patterns, exportable())
         except UnknownNameError as error:
-            raise UsageError(str(error)) from error
+            raise UsageError(
+                f"{error} Those without demonstrations of their own, PointMass and Disturbed, are "
+                "not exported."
+            ) from error
+        if self.folder is not None and self.folder.exists() and not self.folder.is_dir():
+            raise UsageError(f"Expected a folder for datasets at {self.folder}, got a file.")
         if not chosen:
             raise UsageError("Expected environments to export, such as LASA-Angle, got none.")
-        with counted("Exporting", len(chosen)) as advance:
-            for env_id in chosen:
+        with progress("Exporting", len(chosen), "datasets") as told:
+            for done, env_id in enumerate(chosen, start=1):
                 export_minari(env_id, root=self.folder, overwrite=self.replace)
                 print(dataset_id_of(env_id))
-                advance()
+                told(done)
         return 0
 
 

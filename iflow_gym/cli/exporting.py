@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from iflow_gym.cli.console import PIPE, UsageError, output_path, say
+from iflow_gym.cli.console import PIPE, UsageError, check_output, output_path, say
 from iflow_gym.recordings.columns import shown
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ class Export:
             raise UsageError(
                 "Expected a file to write, got standard output, where the snippet goes."
             )
+        check_output(self.output, self.model)
         method, record = load_model_file(self.model, self.method)
         export = getattr(method, "export", None)
         if export is None:

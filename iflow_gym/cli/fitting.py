@@ -14,6 +14,7 @@ from typing import (
     Any,
     Literal,
     Union,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
@@ -21,7 +22,16 @@ from typing import (
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from iflow_gym.cli.console import PIPE, UsageError, output_path, print_json, progress, say
+from iflow_gym.cli.console import (
+    PIPE,
+    UsageError,
+    check_output,
+    check_seed,
+    output_path,
+    print_json,
+    progress,
+    say,
+)
 from iflow_gym.recordings.columns import shown
 
 if TYPE_CHECKING:
@@ -53,7 +63,7 @@ class Fit:
     set: Annotated[tuple[str, ...], UseAppendAction, shown("KEY=VALUE")] = ()
     """A setting of the method; may be given several times. `iflow-gym methods imitation-flow`
     lists those of a method."""
-    preset: Annotated[Literal["smoke", "standard", "full"] | None, shown("PRESET")] = None
+    preset: Annotated[str | None, shown("PRESET")] = None
     """Settings of the leaderboard's presets, smoke, standard or full; --set goes over them. By
     default the method's own."""
     seed: int = 0
@@ -70,17 +80,30 @@ class Fit:
 
         from iflow_gym.cli.motions import load_method_class, load_motion
         from iflow_gym.fit_records import add_fit_record
+        from iflow_gym.watched_training import WatchedGenerator, training_steps
 
         if self.json and self.output == PIPE:
             raise UsageError("Expected one thing for standard output, got the model and --json.")
+        check_output(self.output, self.motion)
+        check_seed(self.seed)
+        if self.preset not in (None, "smoke", "standard", "full"):
+            raise UsageError(
+                f"Expected a preset smoke, standard or full (--preset), got {self.preset!r}."
+            )
         cls = load_method_class(self.method)
         method = make_method(cls, self.method, self.preset, self.set)
         demonstrations, _ = load_motion(self.motion)
         demonstrations = demonstrations.split(self.protocol).fit
         with output_path(self.output, ".safetensors") as path:
             wall, cpu = time.perf_counter(), time.process_time()
-            with progress(f"Fitting {method.title}"):
-                method.fit(demonstrations, seed=self.seed)
+            steps = training_steps(method, demonstrations)
+            with progress(f"Fitting {method.title}", steps, "steps") as told:
+                # What is random in a fit is the seed's, and the generator says how far it is.
+                seed = self.seed if steps is None else WatchedGenerator(self.seed, told)
+                try:
+                    method.fit(demonstrations, seed=cast(int, seed))
+                except (AssertionError, RuntimeError) as error:  # torch's, of a device that is none
+                    raise ValueError(f"{method.title} could not be fitted: {error}") from error
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             method.save(path)
             record = {
@@ -223,7 +246,9 @@ def _value(text: str, hint: Any, key: str) -> Any:
             value = tomllib.loads(f"v = {text}")["v"]
         except tomllib.TOMLDecodeError:
             value = {"true": True, "false": False}.get(text.lower(), text)
-    value = tuple(value) if isinstance(value, list) else value
+    if isinstance(value, list):
+        real = any(get_origin(k) is tuple and get_args(k)[0] is float for k in _types(hint))
+        value = tuple(float(v) if real and type(v) is int else v for v in value)
     if float in _types(hint) and type(value) is int:
         value = float(value)
     if not _fits(value, hint):
@@ -244,7 +269,7 @@ def _fits(value: Any, hint: Any) -> bool:
             if value in get_args(kind):
                 return True
         elif get_origin(kind) is tuple:
-            if isinstance(value, tuple):
+            if isinstance(value, tuple) and all(_fits(v, get_args(kind)[0]) for v in value):
                 return True
         elif kind is Any or (isinstance(kind, type) and type(value) is kind):
             return True
@@ -258,6 +283,8 @@ def _type_name(hint: Any) -> str:
             names += [str(choice) for choice in get_args(kind)]
         elif kind is type(None):
             names.append("none")
+        elif get_origin(kind) is tuple:
+            names.append(f"a list in brackets, each {_type_name(get_args(kind)[0])}")
         else:
             words = {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}
             names.append(words.get(kind, str(kind)))

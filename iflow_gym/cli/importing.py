@@ -11,6 +11,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from iflow_gym.cli.console import (
     PIPE,
     UsageError,
+    check_output,
+    check_picture,
     input_bytes,
     output_path,
     print_json,
@@ -19,7 +21,7 @@ from iflow_gym.cli.console import (
 )
 from iflow_gym.recordings import CleanUp, Columns
 from iflow_gym.recordings.columns import shown
-from iflow_gym.recordings.reading import Format
+from iflow_gym.recordings.reading import FORMATS
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,11 @@ class Import:
         cat reach.csv | iflow-gym import - --format csv -o - | iflow-gym fit - -o policy.safetensors
     """
 
-    sources: Annotated[Positional[tuple[str, ...]], arg(metavar="FILE...")]
+    sources: Annotated[Positional[tuple[str, ...]], shown("FILE...")]
     """Files of recordings, in their order; - reads standard input (with --format)."""
     output: Annotated[str, arg(metavar="FILE", aliases=["-o"])]
     """File of demonstrations to write, such as reach.safetensors; - writes standard output."""
-    format: Annotated[Format | None, shown("FORMAT")] = None
+    format: Annotated[str | None, shown("FORMAT")] = None
     """Format of the sources, where names do not tell: csv, npz, jsonl, mat, rosbag, minari."""
     plot: Annotated[str | None, shown("PICTURE")] = None
     """Picture of before and after to write: .png, .svg or .pdf."""
@@ -63,6 +65,10 @@ class Import:
 
         if not self.sources:
             raise UsageError("Expected at least one file of recordings, got none.")
+        if self.format not in (None, *FORMATS):
+            raise UsageError(
+                f"Expected a format among {', '.join(FORMATS)} (--format), got {self.format!r}."
+            )
         if PIPE in self.sources and self.format is None:
             raise UsageError(
                 "Expected the format of what comes on standard input (--format csv, for instance), "
@@ -72,6 +78,9 @@ class Import:
             raise UsageError("Expected one thing for standard output, got several.")
         if self.sources.count(PIPE) > 1:
             raise UsageError("Expected standard input (-) once among the sources, got it again.")
+        check_output(self.output, *self.sources)
+        if self.plot is not None:
+            check_picture(self.plot)
         sources = [
             Source("standard input", content=input_bytes()) if s == PIPE else Source(s, Path(s))
             for s in self.sources

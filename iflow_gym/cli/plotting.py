@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from iflow_gym.cli.console import PIPE, UsageError, only_one_pipe, progress, save_picture, say
+from iflow_gym.cli.console import (
+    PIPE,
+    UsageError,
+    check_picture,
+    only_one_pipe,
+    progress,
+    save_picture,
+    say,
+)
 from iflow_gym.recordings.columns import shown
 
 if TYPE_CHECKING:
@@ -55,6 +63,9 @@ class Plot:
         from iflow_gym.cli.motions import load_model_file, load_motion
 
         only_one_pipe(self.motion, self.model or "")
+        check_picture(self.output)
+        if self.method is not None and self.model is None:
+            raise UsageError("Expected the model whose method --method names (--model), got none.")
         if not 0 <= self.grid <= 40:
             raise UsageError(f"Expected a grid of 0 to 40 starts a side, got {self.grid}.")
         if not 1 <= self.size <= 40:
@@ -65,8 +76,8 @@ class Plot:
             method, _ = load_model_file(self.model, self.method)
             if method.n_dims_ != demos.n_dims:
                 raise UsageError(
-                    f"Expected a model and a motion of one dimension, got {method.n_dims_} and "
-                    f"{demos.n_dims}."
+                    f"Expected a model and a motion of the same dimension, got {method.n_dims_} "
+                    f"and {demos.n_dims}."
                 )
         elif self.grid:
             raise UsageError("Expected a model to roll out from a grid (--model), got none.")

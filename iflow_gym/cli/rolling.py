@@ -14,6 +14,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from iflow_gym.cli.console import (
     PIPE,
     UsageError,
+    check_output,
     input_bytes,
     only_one_pipe,
     output_path,
@@ -67,6 +68,8 @@ class Rollout:
         from iflow_gym.cli.motions import load_model_file, load_motion
 
         only_one_pipe(self.model, self.starts or "", self.motion or "")
+        if self.output != PIPE:
+            check_output(self.output, self.model, self.starts or "", self.motion or "")
         method, record = load_model_file(self.model, self.method)
         d = method.n_dims_
         starts = [_vector(text, d, "--start") for text in self.start]
@@ -77,10 +80,11 @@ class Rollout:
             demos, _ = load_motion(self.motion)
             if demos.n_dims != d:
                 raise UsageError(
-                    f"Expected a model and a motion of one dimension, got {d} and {demos.n_dims}."
+                    f"Expected a model and a motion of the same dimension, got {d} and "
+                    f"{demos.n_dims}."
                 )
             starts += [] if starts else list(demos.starts)
-            dt = dt or demos.mean_dt
+            dt = demos.mean_dt if dt is None else dt
             if duration is None:
                 duration = (
                     float(demos.durations.max()) if demos.period is None else 2 * demos.period
@@ -188,7 +192,7 @@ def _vector(text: str, d: int, flag: str) -> FloatArray:
     if values.shape != (d,) or not np.isfinite(values).all():
         raise UsageError(
             f"Expected {d} numbers in {flag}, as the model has dimensions, such as "
-            f"{','.join(['0.1'] * d)}, got {text!r}."
+            f"{','.join(['0.1'] * d)}, got {text[:60]!r}."
         )
     return values
 
@@ -206,6 +210,9 @@ def _push(text: str, d: int) -> tuple[float, FloatArray]:
 
 def _starts_of(path: str, d: int) -> list[FloatArray]:
     """Return the starts in a file, one a line."""
+    if path != PIPE and (not Path(path).exists() or Path(path).is_dir()):
+        came = "a folder" if Path(path).is_dir() else "none"
+        raise UsageError(f"Expected a file of starts at {path}, got {came}.")
     text = (
         input_bytes().decode("utf-8", "replace")
         if path == PIPE

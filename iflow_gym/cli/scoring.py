@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from iflow_gym.cli.console import UsageError, only_one_pipe, print_json, progress, say
+from iflow_gym.cli.console import (
+    UsageError,
+    check_seed,
+    only_one_pipe,
+    print_json,
+    progress,
+    say,
+)
 from iflow_gym.recordings.columns import shown
 
 if TYPE_CHECKING:
@@ -56,11 +63,12 @@ class Score:
         from iflow_gym.evaluate import evaluate, motion_of
 
         only_one_pipe(self.model, self.motion)
+        check_seed(self.seed)
         method, record = load_model_file(self.model, self.method)
         demonstrations, env_id = load_motion(self.motion)
         if method.n_dims_ != demonstrations.n_dims:
             raise UsageError(
-                f"Expected a model and a motion of one dimension, got {method.n_dims_} and "
+                f"Expected a model and a motion of the same dimension, got {method.n_dims_} and "
                 f"{demonstrations.n_dims}."
             )
         if (method.period_ is None) != (demonstrations.period is None):
@@ -68,8 +76,8 @@ class Score:
                 "ends" if p is None else "repeats" for p in (method.period_, demonstrations.period)
             ]
             raise UsageError(
-                f"Expected a model and a motion of one kind, got a model that {kinds[0]} and a "
-                f"motion that {kinds[1]}."
+                f"Expected a model and a motion of the same kind, got a model that {kinds[0]} and "
+                f"a motion that {kinds[1]}."
             )
         seen = _seen(record, demonstrations.split(self.protocol).score)
         if self.protocol == "generalisation" and seen:

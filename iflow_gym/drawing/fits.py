@@ -4,17 +4,15 @@ A fit takes a thread. `ImitationFlow` is trained several times over, each time w
 from the beginning: its learning rate goes up and down once in a training, so that a short one is
 better than the beginning of a long one. Other methods are fitted once, with their defaults.
 
-A training is watched, and stopped, through its random numbers: the generator that it draws from
-gives those of the seed, and looks up whenever it is asked for some.
+A training is watched, and stopped, through its random numbers (`iflow_gym.watched_training`).
 """
 
 from __future__ import annotations
 
-import math
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +27,7 @@ from iflow_gym.drawing.motion import accuracy
 from iflow_gym.drawing.strokes import Drawing
 from iflow_gym.drawing.training_steps import TrainingSteps
 from iflow_gym.system import DynamicalSystem
+from iflow_gym.watched_training import WatchedGenerator, training_steps
 
 SEED = 0
 
@@ -203,28 +202,6 @@ class Fits:
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 
-class WatchedGenerator(np.random.Generator):
-    """The numbers of ``np.random.default_rng(seed)``, and a call before each uniform draw.
-
-    Parameters
-    ----------
-    seed : int
-    look : callable
-        Called with the rows that have been drawn so far; what it raises ends the training.
-    """
-
-    def __init__(self, seed: int, look: Callable[[int], None]) -> None:
-        super().__init__(np.random.PCG64(seed))
-        self._look, self._rows = look, 0
-
-    def random(self, size: Any = None, *args: Any, **settings: Any) -> Any:
-        """Draw as `numpy.random.Generator.random` does."""
-        self._look(self._rows)
-        if isinstance(size, tuple) and len(size) == 2:
-            self._rows += size[0]
-        return super().random(size, *args, **settings)
-
-
 def _run(fit: Fit) -> None:
     """Do what is planned, and leave word of how it went."""
     try:
@@ -248,27 +225,24 @@ def _train(fit: Fit, n_steps: int | None) -> Model:
     method = load_system(fit.method)
     assert method is not None, "checked when the fit was asked for"
     settings: Mapping[str, Any] = {}
-    total = math.inf
     if fit.method == DEFAULT_METHOD:
         # On a GPU the small tensors of one model take longer than on a CPU.
         settings = {"n_steps": n_steps, "device": "cpu"}
-        known = method(**settings).config.resolved(
-            cyclic=fit.demonstrations.period is not None, n_dims=fit.demonstrations.n_dims
-        )
-        total = known.n_steps
-    label = f"{total} steps" if math.isfinite(total) else ""
+    unfitted = method(**settings)
+    total = training_steps(unfitted, fit.demonstrations)
+    label = f"{total} steps" if total else ""
     with fit.lock:
         fit.label, fit.progress = label, 0.0
 
     def look(rows: int) -> None:
         if fit.stop.is_set():
             raise Stopped
-        fit.progress = min(rows / total, 1.0)
+        if total:
+            fit.progress = min(rows / total, 1.0)
 
     begin = time.thread_time()
     rng = WatchedGenerator(SEED, look)
-    # `fit` makes its generator by default_rng, which hands a generator through.
-    system = method(**settings).fit(fit.demonstrations, seed=cast(int, rng))
+    system = unfitted.fit(fit.demonstrations, seed=cast(int, rng))
     seconds = time.thread_time() - begin
     with TemporaryDirectory() as folder:
         path = system.save(Path(folder) / "model.safetensors")

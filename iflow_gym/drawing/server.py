@@ -57,6 +57,10 @@ def serve(
         raise ServingError(
             f"Expected the extra draw to be installed, got {error}: pip install 'iflow-gym[draw]'."
         ) from error
+    if not 0 <= port < 2**16:
+        raise ServingError(f"Expected a port from 0 to 65535, got {port}.")
+    if Path(directory).exists() and not Path(directory).is_dir():
+        raise ServingError(f"Expected a folder for drawings at {directory}, got a file.")
     with _listening(port) as listener:
         port = listener.getsockname()[1]
         hosts = [f"{HOST}:{port}", f"localhost:{port}"]
@@ -80,7 +84,7 @@ def _listening(port: int) -> socket.socket:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((HOST, port))
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         listener.close()
         raise ServingError(
             f"Expected port {port} of {HOST} to be free, got: {error}. Choose another by --port; 0 "

@@ -280,8 +280,8 @@ def _check_free(target: Path, overwrite: bool) -> None:
         return
     if not overwrite:
         raise FileExistsError(
-            f"Expected no dataset in {target}, got one: pass overwrite=True to replace it, or "
-            "root=, another folder."
+            f"Expected no dataset in {target}, got one: pass overwrite=True to replace it "
+            "(--replace), or root=, another folder (--folder)."
         )
     from minari.dataset.minari_storage import MinariStorage
 
@@ -292,7 +292,7 @@ def _check_free(target: Path, overwrite: bool) -> None:
     if not ours:
         raise FileExistsError(
             f"Expected a dataset in {target} that export_minari wrote, got something else: it is "
-            "left alone; remove it yourself, or pass root=, another folder."
+            "left alone; remove it yourself, or pass root=, another folder (--folder)."
         )
 
 

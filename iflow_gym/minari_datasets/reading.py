@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iflow_gym.demonstrations import Demonstrations
-from iflow_gym.minari_datasets.store import KEY, check_id, datasets_root, the_minari
+from iflow_gym.minari_datasets.store import KEY, damage_told, load_dataset
 
 
 def read_minari(
@@ -56,25 +56,25 @@ def read_minari(
         If there is no such dataset on this disk: nothing is downloaded.
     ImportError
         If Minari is not installed.
+    DatasetError
+        A ValueError: if it is damaged, or larger than memory should hold.
     ValueError
         If it is not said, or not true, which numbers are positions and how long a step is; or if
         the positions are no demonstrations, as `Demonstrations.from_arrays` says.
     """
-    minari = the_minari()
-    with datasets_root(root) as folder:
-        if not (folder / check_id(dataset_id) / "data").is_dir():
-            local = ", ".join(minari.list_local_datasets()) if folder.is_dir() else ""
-            raise FileNotFoundError(
-                f"Expected the Minari dataset {dataset_id!r} in {folder}, got {local or 'none'}: "
-                f"run `minari download {dataset_id}` first, or pass root=."
-            )
-        dataset = minari.load_dataset(dataset_id)
-    said = dataset.storage.metadata.get(KEY, {})
+    dataset = load_dataset(dataset_id, root)
+    said = _said(dataset)
     chosen = _chosen(episodes, dataset.total_episodes)
     if indices is None and key is None and "n_dims" in said:
         indices = range(said["n_dims"])
-    played = dataset.iterate_episodes([int(dataset.episode_indices[i]) for i in chosen])
-    positions = [_positions(episode.observations, key, indices) for episode in played]
+    with damage_told(dataset_id):
+        played = [
+            episode.observations
+            for episode in dataset.iterate_episodes(
+                [int(dataset.episode_indices[i]) for i in chosen]
+            )
+        ]
+    positions = [_positions(observations, key, indices) for observations in played]
     if goal is None and period is None:
         goal, period = said.get("goal"), said.get("period")
     return Demonstrations.from_arrays(
@@ -85,9 +85,33 @@ def read_minari(
         period=period,
         name=name or said.get("name", dataset_id),
         length_unit=length_unit or said.get("length_unit", "m"),
-        source=f"Minari dataset {dataset_id}" + (f", {said['source']}" if said else ""),
+        source=f"Minari dataset {dataset_id}" + (f", {said['source']}" if "source" in said else ""),
         held_out=said.get("held_out", 0) if episodes is None else 0,
     )
+
+
+_SAID: dict[str, tuple[type, ...]] = {
+    "name": (str,), "source": (str,), "length_unit": (str,), "n_dims": (int,), "held_out": (int,),
+    "period": (int, float), "goal": (list,),
+}  # fmt: skip
+"""What `export_minari` adds to a dataset's metadata and is read again, by its types."""
+
+MOST_DIMS = 1000
+
+
+def _said(dataset: Any) -> dict[str, Any]:
+    """Return what `export_minari` said of a dataset; empty if another program wrote it."""
+    with damage_told(dataset.spec.dataset_id):
+        said = dataset.storage.metadata.get(KEY, {})
+        if not isinstance(said, dict):
+            raise ValueError(f"what {KEY} says is {said!r:.40}")
+        found = {name: said[name] for name in _SAID if name in said}
+        for name, value in found.items():
+            if type(value) not in _SAID[name]:
+                raise ValueError(f"its {name} is {value!r:.40}")
+        if not 1 <= found.get("n_dims", 1) <= MOST_DIMS:
+            raise ValueError(f"its n_dims is {found['n_dims']!r:.40}")
+    return found
 
 
 def _chosen(episodes: Sequence[int] | None, total: int) -> list[int]:
@@ -101,14 +125,17 @@ def _chosen(episodes: Sequence[int] | None, total: int) -> list[int]:
 
 def _steps(dataset: Any, chosen: Sequence[int]) -> list[float]:
     """Return the seconds a step that the episodes' metadata say."""
-    found = dataset.storage.get_episode_metadata([int(dataset.episode_indices[i]) for i in chosen])
+    with damage_told(dataset.spec.dataset_id):
+        indices = [int(dataset.episode_indices[i]) for i in chosen]
+        found = list(dataset.storage.get_episode_metadata(indices))
     steps = [episode.get("dt") for episode in found]
     if any(step is None for step in steps):
         raise ValueError(
             f"Expected dt=, the seconds between an observation and the next: "
             f"{dataset.spec.dataset_id!r} does not say it."
         )
-    return [float(step) for step in steps]
+    with damage_told(dataset.spec.dataset_id):
+        return [float(step) for step in steps]
 
 
 def _positions(

@@ -19,6 +19,9 @@ from iflow_gym.recordings.steps import STILL, Align, BadTimes, Missing, Note
 LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254}
 """Metres in units of length."""
 
+MOST_LENGTH = 1e100
+"""Of a recording's diagonal, in any unit: the square of more is no number."""
+
 
 @dataclass(frozen=True)
 class CleanUp:
@@ -124,8 +127,8 @@ def clean(
     if len({r.n_dims for r in done}) > 1:
         dims = sorted({r.n_dims for r in done})
         raise RecordingError(
-            f"Expected recordings of one dimension, got dimensions {dims}: name the same columns "
-            "of every file."
+            f"Expected recordings of the same dimension, got dimensions {dims}: name the same "
+            "columns of every file."
         )
     decision = decide(done, chosen.kind if chosen.period is None else "goal")
     kind = decision.kind
@@ -180,6 +183,13 @@ def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> Raw
         raise RecordingError(
             f"Expected at least {LEAST_SAMPLES} samples of {recording.name}, got {len(recording)}."
         )
+    with np.errstate(over="ignore"):
+        diagonal = recording.diagonal
+    if not diagonal < MOST_LENGTH:
+        raise RecordingError(
+            f"Expected {recording.name} to go no farther than {MOST_LENGTH:g}, got {diagonal:g}: "
+            "look at the columns and at the file."
+        )
     if chosen.trim:
         if not (np.isfinite(chosen.still) and 0 <= chosen.still < 1):
             raise RecordingError(f"Expected still from 0 to below 1, got {chosen.still}.")
@@ -193,7 +203,8 @@ def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> Raw
             raise RecordingError(
                 f"Expected even samples of {recording.name}, because resampling was left out; they "
                 f"are {note.values['least_step_seconds']:.3g} to "
-                f"{note.values['longest_step_seconds']:.3g} s apart: resample them."
+                f"{note.values['longest_step_seconds']:.3g} s apart: resample them (leave out "
+                "--no-resample)."
             )
     return noted(steps.smoothed(recording, chosen.smooth, rough))
 
@@ -230,6 +241,8 @@ def _check_ends(
     target = ends.mean(axis=0) if goal is None else goal
     samples = np.concatenate([r.positions for r in done])
     diagonal = float(np.linalg.norm(np.ptp(samples, axis=0)))
+    if chosen.goal_tolerance is not None and not chosen.goal_tolerance >= 0:
+        raise RecordingError(f"Expected a goal tolerance >= 0, got {chosen.goal_tolerance}.")
     allowed = GOAL_TOLERANCE * diagonal if chosen.goal_tolerance is None else chosen.goal_tolerance
     away = np.linalg.norm(ends - target, axis=1)
     if away.max() > allowed:

@@ -32,21 +32,18 @@ def read(source: Source, columns: Columns) -> Reading:
     ImportError
         Without the extra ``minari``.
     """
-    from iflow_gym.minari_datasets.store import the_minari
+    from iflow_gym.minari_datasets.store import damage_told, load_dataset
 
-    minari = the_minari()
     if source.content is not None:
         raise RecordingError("Expected a Minari dataset by its id, got standard input.")
     try:
-        dataset = minari.load_dataset(source.name)
-        episodes = list(dataset.iterate_episodes())
-        env_spec = dataset.spec.env_spec
-    except ImportError:
-        raise
-    except Exception as error:  # whatever Minari and HDF5 make of a folder that is none
+        dataset = load_dataset(source.name)
+        with damage_told(source.name):
+            episodes = list(dataset.iterate_episodes())
+            env_spec = dataset.spec.env_spec
+    except (FileNotFoundError, ValueError) as error:
         raise RecordingError(
-            f"Expected a Minari dataset {source.name} on this machine, got {error}: `minari list "
-            f"local` says which there are, `minari download {source.name}` gets one."
+            f"{error} `minari list local` says which datasets there are."
         ) from error
     env_id = getattr(env_spec, "id", None) or ""
     reading = Reading()
@@ -79,7 +76,10 @@ def _positions(
             )
         observations, chosen = observations[key], chosen[1:] if chosen else None
     try:
-        values = np.asarray(observations, dtype=np.float64)
+        values = np.asarray(observations)
+        if values.dtype.kind not in "fiub":
+            raise TypeError(f"values of type {values.dtype}")
+        values = values.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise RecordingError(f"Expected observations of numbers in {name}, got {error}.") from error
     if values.ndim != 2:
@@ -114,10 +114,10 @@ def _times(
     known = infos if isinstance(infos, dict) else {}
     key = columns.time or next((k for k in TIMES if k in known), None)
     if key is not None and key in known:
-        times = np.asarray(known[key], dtype=np.float64)
-        if times.shape == (n,):
-            return times, f"time infos {key}"
+        times = np.asarray(known[key])
+        if times.shape == (n,) and times.dtype.kind in "fiu":
+            return times.astype(np.float64), f"time infos {key}"
     raise RecordingError(
-        f"Expected times in the infos of {name}, got "
+        f"Expected the times of {n} observations in the infos of {name}, got "
         f"{', '.join(map(str, known)) or 'none'}: give the seconds a sample (--dt)."
     )

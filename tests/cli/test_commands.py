@@ -8,11 +8,14 @@ import re
 import socket
 import subprocess
 import sys
+import sysconfig
+from importlib import metadata
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from iflow_gym.cli import run
+from iflow_gym.cli import main, run
 from iflow_gym.cli.commands import COMMANDS
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstration_files import load_demonstrations, save_demonstrations
@@ -31,6 +34,7 @@ def folder(tmp_path_factory):
     """A folder with a recording, demonstrations and models of them."""
     path = tmp_path_factory.mktemp("cli")
     (path / "reach.csv").write_text(CSV)
+    (path / "broken.py").write_text("1 / 0\n")
     motion = load_lasa("Angle")
     thin = Demonstrations.from_arrays(
         [p[::-1][::20][::-1] for p in motion.positions],
@@ -93,6 +97,22 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_the_installed_script_is_the_command(folder):
+    """The one that pip makes of pyproject.toml's entry, where the tests run."""
+    (entry,) = metadata.entry_points(group="console_scripts", name="iflow-gym")
+    assert entry.load() is main
+    script = Path(sysconfig.get_path("scripts")) / "iflow-gym"
+    if not script.exists():
+        pytest.skip("the package is imported from a folder, and not installed")
+    done = subprocess.run(
+        [script, "fit", "LASA-Angel", "-o", "m"], cwd=folder, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("iflow-gym: Expected a motion")
+    assert "Did you mean LASA-Angle" in done.stderr
+
+
 def test_completion_knows_the_commands(call):
     _, output, _ = call("--tyro-print-completion", "bash")
     assert all(name in output for name in COMMANDS)
@@ -114,7 +134,12 @@ def test_completion_knows_the_commands(call):
         (["fit", "LASA-Angel", "-o", "m"], "LASA-Angle"),
         (["fit", "PointMass", "-o", "m"], "iflow-gym import"),
         (["fit", "angle.safetensors", "-o", "no/such/folder/m"], "Expected a folder"),
-        (["envs", "nothing*"], "nothing"),
+        (["fit", "", "-o", "m"], "neither"),
+        (["fit", ".", "-o", "m"], "a folder"),
+        (["fit", "iflow/Angel-v0", "-o", "m"], "Did you mean LASA-Angle"),
+        (["envs", "nothing*"], "Unknown environment 'nothing*'. `iflow-gym envs` lists"),
+        (["envs", "LASA-Angel"], "Did you mean LASA-Angle"),
+        (["envs", "heee-v0"], "Did you mean LASA-heee"),
         (["data", "where", "nothing"], "nothing"),
         (["rollout", "linear.safetensors"], "--start"),
         (["rollout", "linear.safetensors", "--start", "1"], "2 numbers"),
@@ -124,6 +149,28 @@ def test_completion_knows_the_commands(call):
         (["plot", "angle.safetensors", "-o", "a.png", "--grid", "4"], "--model"),
         (["export", "linear.safetensors", "-o", "a.onnx"], "imitation-flow"),
         (["score", "-", "-"], "one of the inputs"),
+        (["import", "reach.csv", "-o", "reach.csv"], "which is one of them"),
+        (["import", "reach.csv", "-o", "a", "--plot", "a.gif"], ".png"),
+        (["import", "reach.csv", "-o", "a", "--format", "xyz"], "csv, npz"),
+        (["fit", "angle.safetensors", "-o", "angle.safetensors"], "which is one of them"),
+        (["fit", "angle.safetensors", "-o", ""], "an empty name"),
+        (["fit", "angle.safetensors", "-o", "m", "--seed", "-1"], "seed >= 0"),
+        (["fit", "angle.safetensors", "-o", "m", "--preset", "fast"], "smoke, standard or full"),
+        (["fit", "angle.safetensors", "-o", "m", "--method", ".:"], "module:Class"),
+        (["fit", "angle.safetensors", "-o", "m", "--method", "broken:Mine"], "ZeroDivisionError"),
+        (
+            ["fit", "angle.safetensors", "-o", "m", "--method", "bc", "--set", "decays=['a']"],
+            "each a number",
+        ),
+        (["score", "linear.safetensors", "angle.safetensors", "--seed", "-1"], "seed >= 0"),
+        (["plot", "angle.safetensors", "-o", "a.png", "--method", "linear"], "--model"),
+        (["rollout", "linear.safetensors", "--starts", "absent"], "absent, got none"),
+        (
+            ["rollout", "linear.safetensors", "--motion", "angle.safetensors", "--dt", "0"],
+            "time step > 0",
+        ),
+        (["export", "linear.safetensors", "-o", "no/a.onnx"], "Expected a folder"),
+        (["data", "export-minari", "LASA-Angle", "--folder", "reach.csv"], "got a file"),
     ],
 )
 def test_what_is_not_understood_is_2_and_says_why(call, arguments, message):
@@ -140,7 +187,10 @@ def test_what_is_not_understood_is_2_and_says_why(call, arguments, message):
         (["import", "absent.csv", "-o", "a"], "absent.csv"),
         (["import", "reach.csv", "-o", "a", "--time", "stamp"], "'stamp'"),
         (["fit", "reach.csv", "-o", "m"], "iflow-gym import"),
-        (["score", "absent", "angle.safetensors"], "absent"),
+        (["score", "absent", "angle.safetensors"], "Expected a model at absent"),
+        (["fit", "angle.safetensors", "-o", "m", "--set", "device=tpu"], "could not be fitted"),
+        (["draw", "--no-open", "--port", "70000"], "from 0 to 65535"),
+        (["draw", "--no-open", "--directory", "reach.csv"], "a folder for drawings"),
         (["score", "reach.csv", "angle.safetensors"], "model file"),
         (["score", "angle.safetensors", "angle.safetensors"], "got demonstrations"),
         (["fit", "linear.safetensors", "-o", "m"], "holds a model"),
@@ -178,7 +228,7 @@ def test_import_reports_draws_and_writes(call, folder):
 def test_fit_writes_a_model_that_says_what_it_was_fitted_on(call, folder):
     status, output, said = call(
         "fit", "angle.safetensors", "-o", "again.safetensors", "--method", "linear",
-        "--set", "margin=2", "--json",
+        "--set", "margin=2", "--set", "noise_horizons=[1, 5]", "--json",
     )  # fmt: skip
     assert status == 0
     assert "Stability: proved." in said
@@ -186,6 +236,7 @@ def test_fit_writes_a_model_that_says_what_it_was_fitted_on(call, folder):
     assert told["settings"]["margin"] == 2.0
     model = load_model(folder / "again.safetensors")
     assert model.config.margin == 2.0
+    assert repr(model.config.noise_horizons) == "(1, 5)"
     record = inspect_model(folder / "again.safetensors").fit
     assert (record["protocol"], len(record["recordings"])) == ("reproduction", 7)
 
@@ -356,6 +407,26 @@ def test_data_says_where_and_verifies(call, monkeypatch, tmp_path):
     assert (status, "30 of 30" in output) == (0, True)
 
 
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_on_a_terminal_a_fit_says_how_many_of_its_steps_are_done(call, folder, monkeypatch):
+    """And it is the fit that it is without one."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    arguments = ("fit", "angle.safetensors", "--set", "n_steps=80", "-o")
+    assert call(*arguments, "plain.safetensors")[0] == 0
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    assert call(*arguments, "watched.safetensors")[0] == 0
+    for text in ("80%, 64 of 80 steps", "Fitting ImitationFlow: finishing"):
+        assert text in terminal.getvalue()
+    plain, watched = (load_model(folder / f"{n}.safetensors") for n in ("plain", "watched"))
+    states = load_demonstrations(folder / "angle.safetensors").starts
+    np.testing.assert_array_equal(plain.velocity(states), watched.velocity(states))
+
+
 # Pipes --------------------------------------------------------------------------------------
 
 
@@ -385,3 +456,21 @@ def test_who_has_read_enough_is_not_complained_to(folder):
     assert done.stdout.splitlines()[0] == b"start,t,x,y,vx,vy"
     assert done.stderr == b""
     assert done.returncode == 141
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "said"),
+    [
+        ("iflow-gym methods >&-", 2, b"Expected a standard output, got a closed one"),
+        ("iflow-gym fit - -o m <&-", 2, b"Expected a file on standard input (-), got a closed one"),
+        ("iflow-gym fit nothing -o m 2>&-", 2, b""),
+        ("iflow-gym methods > /dev/full", 1, b"got: No space left on device."),
+    ],
+)
+def test_closed_and_full_streams_are_told(folder, line, status, said):
+    if "/dev/full" in line and not Path("/dev/full").exists():
+        pytest.skip("there is no device that is full")
+    done = piped(folder, line)
+    assert (done.returncode, done.stdout) == (status, b"")
+    assert said in done.stderr
+    assert b"Traceback" not in done.stderr

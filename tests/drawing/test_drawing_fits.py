@@ -8,11 +8,12 @@ from iflow_gym.baselines.imitation_flow import ImitationFlow
 from iflow_gym.baselines.linear import StableLinear
 from iflow_gym.baselines.registry import METHODS, load_method
 from iflow_gym.drawing import fits as fits_module
-from iflow_gym.drawing.fits import Fits, Stopped, WatchedGenerator, method_entries
+from iflow_gym.drawing.fits import Fits, Stopped, method_entries
 from iflow_gym.drawing.motion import HALF, LOST, N_GRID, accuracy, field_on_grid, paths_from
 from iflow_gym.drawing.strokes import drawing_of
 from iflow_gym.drawing.training_steps import TrainingSteps
 from iflow_gym.primitive import MovementPrimitive
+from iflow_gym.watched_training import WatchedGenerator
 
 REACHES = drawing_of([reach(k) for k in range(3)], "goal")
 
