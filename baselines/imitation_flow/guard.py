@@ -147,7 +147,7 @@ class GuardedAdam:
     ) -> None:
         self._names, self._max_norm = list(names), max_norm
         self._parameters, self._axes = zip(*parameters, strict=True)
-        self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
+        self._flat = nn.Parameter(self.joined([p.detach() for p in self._parameters]))
         self._make_views()
         self._moments = [torch.zeros_like(self._flat.data) for _ in range(2)]
         self._n_taken = torch.zeros((), dtype=torch.float32, device=self._flat.device)
@@ -168,20 +168,30 @@ class GuardedAdam:
 
         Where the loss has weights that change within a stage, what is judged is one without.
         """
-        judged = loss.detach() if judged is None else judged.detach()
+        self.begin(step, stage)
+        gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
+        gradient = self.joined(
+            [torch.zeros_like(p) if g is None else g
+             for g, p in zip(gradients, self._parameters, strict=True)]
+        )  # fmt: skip
+        self.descend(step, gradient, loss.detach() if judged is None else judged.detach())
+
+    def begin(self, step: int, stage: int) -> None:
+        """Judge the stage before, if this is a new one; before gradients are taken."""
         if stage != self._stage:
             self.look(step)
             self._stage, self._begins = stage, True
             self._best.fill_(torch.inf)
+
+    def descend(self, step: int, gradient: Tensor, judged: Tensor) -> None:
+        """Take a step down a gradient (m, p), a row a model in the parameters' order.
+
+        What is judged is the loss, (m,). The gradient is overwritten.
+        """
         if self._begins:  # a stage begins: what it has to be better than
             self._first = judged.clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
             self._begins = bool(self._best.isinf().all())
-        gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
-        gradient = self._joined(
-            [torch.zeros_like(p) if g is None else g
-             for g, p in zip(gradients, self._parameters, strict=True)]
-        )  # fmt: skip
         norm, self._last = gradient.norm(dim=1), judged
         if self.failures or not math.isfinite(norm.sum()):
             trains = norm.isfinite() & ~self.failed
@@ -258,7 +268,7 @@ class GuardedAdam:
         """Return the parameters and Adam's moments."""
         return [self._flat.data, *self._moments]
 
-    def _joined(self, tensors: Sequence[Tensor]) -> Tensor:
+    def joined(self, tensors: Sequence[Tensor]) -> Tensor:
         """Join tensors of the parameters' shapes to (m, p)."""
         rows = [t.movedim(axis, 0) for t, axis in zip(tensors, self._axes, strict=True)]
         return torch.cat([t.reshape(len(t), -1) for t in rows], dim=1)

@@ -14,6 +14,7 @@ h + 1). Biases are the weights of an input that is 1 and of a unit that is 1: it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,10 +53,29 @@ class Trace(NamedTuple):
     """(layers, ..., moved, n): exp(s), or exp(-s) of the inverse."""
 
 
-def forward(xp: Any, z: Array, context: Array | None, w: Weights) -> tuple[Array, Trace]:
+class Memory:
+    """Arrays that are used again, step by step: new ones cost the kernel's pages every time.
+
+    What a pass returns with a memory is overwritten by the next pass of its shapes with it.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[Any, Any] = {}
+
+    def take(self, key: tuple[str, Array], make: Callable[[], Any]) -> Any:
+        """Return what was made for a key's name and shape before, or make it."""
+        name, like = key
+        known = name, tuple(like.shape)
+        if known not in self._kept:
+            self._kept[known] = make()
+        return self._kept[known]
+
+
+def forward(
+    xp: Any, z: Array, context: Array | None, w: Weights, memory: Memory | None = None
+) -> tuple[Array, Trace]:
     """Return y = h(z), (..., d, n), and the trace."""
-    k, trace = w.n_kept, _empty_trace(xp, z, context, w)
-    out = _empty(xp, z, w.out.shape[1:-1])
+    k, trace, out = w.n_kept, *_begun("forward", xp, z, context, w, memory)
     trace.states[0] = z
     for layer in range(len(w.rotation)):
         u, y = trace.turned[layer], trace.states[layer + 1]
@@ -69,10 +89,10 @@ def forward(xp: Any, z: Array, context: Array | None, w: Weights) -> tuple[Array
 
 
 def forward_gradient(
-    xp: Any, g: Array, trace: Trace, w: Weights
+    xp: Any, g: Array, trace: Trace, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of z, of the context and of R, W1, W2, from that of y."""
-    k, work = w.n_kept, _Work(xp, g, trace, w)
+    k, work = w.n_kept, _working("forward gradient", xp, g, trace, w, memory)
     for layer in reversed(range(len(w.rotation))):
         u, g_b, g_u = trace.turned[layer], work.g[..., k:, :], work.g_u
         g_moved = g_u[..., k:, :]
@@ -86,10 +106,11 @@ def forward_gradient(
     return work.g, work.g_context, (work.g_rotation, work.g_hidden, work.g_out)
 
 
-def inverse(xp: Any, y: Array, context: Array | None, w: Weights) -> tuple[Array, Array, Trace]:
+def inverse(
+    xp: Any, y: Array, context: Array | None, w: Weights, memory: Memory | None = None
+) -> tuple[Array, Array, Trace]:
     """Return z = h^-1(y), (..., d, n), log |det dz/dy|, (..., n), and the trace."""
-    k, trace = w.n_kept, _empty_trace(xp, y, context, w)
-    out = _empty(xp, y, w.out.shape[1:-1])
+    k, trace, out = w.n_kept, *_begun("inverse", xp, y, context, w, memory)
     trace.states[-1] = y
     for layer in reversed(range(len(w.rotation))):
         u, y = trace.turned[layer], trace.states[layer + 1]
@@ -103,10 +124,10 @@ def inverse(xp: Any, y: Array, context: Array | None, w: Weights) -> tuple[Array
 
 
 def inverse_gradient(
-    xp: Any, g: Array, g_log_det: Array, trace: Trace, w: Weights
+    xp: Any, g: Array, g_log_det: Array, trace: Trace, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of y, of the context and of R, W1, W2, from those of z and log |det|."""
-    k, work = w.n_kept, _Work(xp, g, trace, w)
+    k, work = w.n_kept, _working("inverse gradient", xp, g, trace, w, memory)
     for layer in range(len(w.rotation)):
         u, g_u = trace.turned[layer], work.g_u
         xp.matmul(u, work.g.swapaxes(-1, -2), out=work.g_rotation[layer])
@@ -132,19 +153,28 @@ class _Work:
         lead, d = g.shape[:-2], g.shape[-2]
         n_moved = d - w.n_kept
         self.g = _empty(xp, g, (*lead, d))
-        self.g[...] = g
         self.g_u = _empty(xp, g, (*lead, d))
         self.g_both = _empty(xp, g, (*lead, 2 * n_moved))
         self.g_s, self.g_shift = self.g_both[..., :n_moved, :], self.g_both[..., n_moved:, :]
         self.g_units, self.g_seen = _empty(xp, g, (*lead, h)), _empty(xp, g, (*lead, seen))
         self.g_context = _empty(xp, g, (*lead, seen - 1 - w.n_kept))
-        self.g_context[...] = 0
         self.g_rotation, self.g_hidden, self.g_out = (
             xp.empty_like(x) for x in (w.rotation, w.hidden, w.out)
         )
+        self.slopes, self.narrows = xp.empty_like(trace.units), xp.empty_like(trace.squashed)
+
+    def begin(self, g: Array, trace: Trace, w: Weights) -> None:
+        """Take in the gradient of what the pass returned."""
+        self.g[...] = g
+        self.g_context[...] = 0
         # 1 - tanh^2 of the units and, with the bound, of the log-scales.
-        self.slopes = 1 - trace.units * trace.units
-        self.narrows = w.bound * (1 - trace.squashed * trace.squashed)
+        for squares, slopes, factor in (
+            (trace.units, self.slopes, 1.0),
+            (trace.squashed, self.narrows, w.bound),
+        ):
+            self.xp.multiply(squares, squares, out=slopes)
+            slopes *= -factor
+            slopes += factor
 
     def conditioner(self, trace: Trace, w: Weights, layer: int) -> Array:
         """Take the weights' gradients from those of s and t; return that of what was seen."""
@@ -158,6 +188,29 @@ class _Work:
         if self.g_context.shape[-2]:
             self.g_context += self.g_seen[..., w.n_kept : -1, :]
         return self.g_seen
+
+
+def _working(
+    name: str, xp: Any, g: Array, trace: Trace, w: Weights, memory: Memory | None
+) -> _Work:
+    memory = Memory() if memory is None else memory
+    work: _Work = memory.take((name, g), lambda: _Work(xp, g, trace, w))
+    work.begin(g, trace, w)
+    return work
+
+
+def _begun(
+    name: str, xp: Any, state: Array, context: Array | None, w: Weights, memory: Memory | None
+) -> tuple[Trace, Array]:
+    """Return an empty trace of a pass, and what the conditioners' outputs go to."""
+    memory = Memory() if memory is None else memory
+    made: tuple[Trace, Array] = memory.take(
+        (name, state),
+        lambda: (_empty_trace(xp, state, w), _empty(xp, state, w.out.shape[1:-1])),
+    )
+    if context is not None:
+        made[0].seen[..., w.n_kept : -1, :] = context
+    return made
 
 
 def _coefficients(
@@ -193,14 +246,12 @@ def _empty(xp: Any, like: Array, lead: tuple[int, ...]) -> Array:
     return xp.empty(shape, dtype=like.dtype, device=like.device)
 
 
-def _empty_trace(xp: Any, z: Array, context: Array | None, w: Weights) -> Trace:
+def _empty_trace(xp: Any, z: Array, w: Weights) -> Trace:
     n_layers, (d, _) = len(w.rotation), z.shape[-2:]
     lead, (h, n_seen) = (n_layers, *z.shape[:-2]), w.hidden.shape[-2:]
     n_moved = d - w.n_kept
     seen = _empty(xp, z, (*lead, n_seen))
     seen[..., -1, :] = 1
-    if context is not None:
-        seen[..., w.n_kept : -1, :] = context
     return Trace(
         _empty(xp, z, (n_layers + 1, *z.shape[:-2], d)),
         _empty(xp, z, (*lead, d)),

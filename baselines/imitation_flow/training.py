@@ -39,6 +39,7 @@ from torch import Tensor, nn
 
 from iflow_gym.baselines.imitation_flow.calm import Calm, Calmness, Sampling
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
+from iflow_gym.baselines.imitation_flow.coupling import CouplingFlow
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
@@ -62,6 +63,7 @@ from iflow_gym.baselines.imitation_flow.objectives import (
     tube,
 )
 from iflow_gym.baselines.imitation_flow.passes import Term, encode, evaluate
+from iflow_gym.baselines.imitation_flow.whole_step import Preparation, Weights, WholeStep
 
 SQUARED_ERROR_WEIGHT = 300.0
 """Weight of the squared error, against which the penalties are measured."""
@@ -232,6 +234,7 @@ class _Batch:
         self._orbit: MeanOrbit | None = None
         if data.cyclic and resolved.orbit_weight > 0:
             self._orbit = MeanOrbit(tasks, data, config.orbit_resolution)
+        self._whole = _whole_step(config, self.flow, self.latent, data, self.watched, rngs)
         self._inward: Inward | None = None
         if data.cyclic and resolved.inward_weight > 0:
             self._inward = Inward(data)
@@ -261,8 +264,14 @@ class _Batch:
 
     def step(self, adam: GuardedAdam, step: int, stage: int) -> None:
         """Take one step of a stage."""
+        weights = _weights(self._config, self.resolved, step, stage)
+        if self._whole is not None:
+            adam.begin(step, stage)
+            judged, gradients = self._whole(weights)
+            adam.descend(step, adam.joined(gradients), judged)
+            return
         self._draws.new_step()
-        terms = _terms(self._config, step, stage, self.latent, self.data, self._draws)
+        terms = _terms(self._config, weights, self.latent, self.data, self._draws)
         calm, calm_weight = self._calm, self.resolved.calm_weight
         if calm is not None:
             terms.append((calm_weight, calm(self._draws)))
@@ -320,6 +329,28 @@ def _calm_down(
     return Calmness(float(speeds), rounds), restarts
 
 
+def _whole_step(
+    config: ImitationFlowConfig,
+    flow: Flow,
+    latent: Latent,
+    data: Recordings,
+    calm: Calm | None,
+    rngs: Sequence[np.random.Generator],
+) -> WholeStep | None:
+    """Return the step by hand, where there is one."""
+    if (
+        calm is None
+        or data.device.type != "cpu"
+        or data.n_dims != 2
+        or data.context is not None
+        or not isinstance(flow, CouplingFlow)
+        or not isinstance(latent, LinearLatent)
+    ):
+        return None
+    prepared = Preparation(config, data, rngs, N_HORIZONS, _n_pairs(config), calm.n_new)
+    return WholeStep(flow, latent, data, calm, prepared, config)
+
+
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
     n, d, cyclic = len(tasks), tasks[0].n_dims, tasks[0].cyclic
     min_decay = config.resolved(cyclic=cyclic, n_dims=d).min_decay
@@ -335,41 +366,54 @@ def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
 # What a step minimises --------------------------------------------------------------------
 
 
+def _weights(config: ImitationFlowConfig, resolved: Resolved, step: int, stage: int) -> Weights:
+    """Return the weights of a step's terms."""
+    if stage != WHOLE:
+        return Weights(1.0, 0.0, 0.0, resolved.calm_weight)
+    turn = step % TURNS
+    return Weights(
+        TURNS * config.likelihood_weight * (turn == 0),
+        SQUARED_ERROR_WEIGHT,
+        TURNS * SQUARED_ERROR_WEIGHT * config.tube_weight * (turn == TURNS // 2),
+        resolved.calm_weight,
+    )
+
+
 def _terms(
     config: ImitationFlowConfig,
-    step: int,
-    stage: int,
+    weights: Weights,
     latent: Latent,
     data: Recordings,
     draws: Draws,
 ) -> list[tuple[float, Term]]:
     """Return the weighted terms of a step, but for the calm and the orbit."""
-    q, p = N_HORIZONS, max(1, config.n_pairs // N_HORIZONS)
+    q, p = N_HORIZONS, _n_pairs(config)
     if config.objective == "paper":
         return [(1.0, backward_likelihood(latent, data, draws, q, p))]
     terms: list[tuple[float, Term]] = []
-    whole = stage == WHOLE
-    turn = step % TURNS
-    weight = TURNS * config.likelihood_weight * (turn == 0) if whole else 1.0
-    if weight:
-        terms.append((weight, forward_likelihood(latent, data, draws, q, p)))
+    if weights.likelihood:
+        terms.append((weights.likelihood, forward_likelihood(latent, data, draws, q, p)))
     if data.cyclic:
         terms.append((1.0, stationary(latent, data, draws, q * p)))
-    if whole:
-        n, weight = config.n_times, SQUARED_ERROR_WEIGHT
+    if weights.reproduction:
         error = reproduction(
             data,
             draws,
-            n,
+            config.n_times,
             power=config.error_power,
             timing_weight=config.timing_weight,
             end_weight=config.end_weight,
         )
-        terms.append((weight, error))
-        if config.tube_weight and turn == TURNS // 2:
-            beside = tube(data, draws, max(n // 2, 1), width=config.tube_width)
-            terms.append((TURNS * weight * config.tube_weight, beside))
+        terms.append((weights.reproduction, error))
+    if weights.tube:
+        beside = tube(data, draws, max(config.n_times // 2, 1), width=config.tube_width)
+        terms.append((weights.tube, beside))
     return terms
+
+
+def _n_pairs(config: ImitationFlowConfig) -> int:
+    """Return the pairs of a horizon in a step's likelihood."""
+    return max(1, config.n_pairs // N_HORIZONS)
 
 
 def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
@@ -390,7 +434,7 @@ def _resolved(config: ImitationFlowConfig, data: Recordings) -> Resolved:
 def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:
     """Return how many random numbers a step draws at most."""
     n, d = data.n_recordings, data.n_dims
-    pairs = N_HORIZONS * max(1, config.n_pairs // N_HORIZONS)
+    pairs = N_HORIZONS * _n_pairs(config)
     return (
         2 * N_HORIZONS
         + 3 * pairs
