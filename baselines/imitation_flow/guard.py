@@ -134,6 +134,8 @@ class GuardedAdam:
         Models that do not train on, and why.
     failed : Tensor of bool, shape (m,)
         Which these are.
+    gradients : list of Tensor
+        What `descend` goes down, in the parameters' shapes: views of one array (m, p).
     """
 
     def __init__(
@@ -147,12 +149,18 @@ class GuardedAdam:
     ) -> None:
         self._names, self._max_norm = list(names), max_norm
         self._parameters, self._axes = zip(*parameters, strict=True)
-        self._flat = nn.Parameter(self.joined([p.detach() for p in self._parameters]))
-        self._make_views()
-        self._moments = [torch.zeros_like(self._flat.data) for _ in range(2)]
+        n_models = self._parameters[0].shape[self._axes[0]]
+        size = sum(p.numel() for p in self._parameters) // n_models
+        first = self._parameters[0].detach()
+        self._flat, self._gradient = (first.new_empty(n_models, size) for _ in range(2))
+        self.gradients = self._views(self._gradient)
+        for parameter, view in zip(self._parameters, self._views(self._flat), strict=True):
+            view.copy_(parameter.detach())
+            parameter.data = view
+        self._moments = [torch.zeros_like(self._flat) for _ in range(2)]
         self._n_taken = torch.zeros((), dtype=torch.float32, device=self._flat.device)
         self._cycle, self._taken = one_cycle(learning_rate, n_steps), 0
-        like = self._flat.detach()[:, 0]
+        like = self._flat[:, 0]
         self._rate, self._sum = torch.ones_like(like), torch.zeros_like(like)
         self._best, self._kept = torch.full_like(like, torch.inf), torch.full_like(like, torch.inf)
         self._first = self._last = torch.zeros_like(like)
@@ -169,12 +177,15 @@ class GuardedAdam:
         Where the loss has weights that change within a stage, what is judged is one without.
         """
         self.begin(step, stage)
-        gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
-        gradient = self.joined(
-            [torch.zeros_like(p) if g is None else g
-             for g, p in zip(gradients, self._parameters, strict=True)]
-        )  # fmt: skip
-        self.descend(step, gradient, loss.detach() if judged is None else judged.detach())
+        gradients: Sequence[Tensor | None] = torch.autograd.grad(
+            loss.sum(), self._parameters, allow_unused=True
+        )
+        for own, gradient in zip(self.gradients, gradients, strict=True):
+            if gradient is None:
+                own.zero_()
+            else:
+                own.copy_(gradient)
+        self.descend(step, loss.detach() if judged is None else judged.detach())
 
     def begin(self, step: int, stage: int) -> None:
         """Judge the stage before, if this is a new one; before gradients are taken."""
@@ -183,11 +194,9 @@ class GuardedAdam:
             self._stage, self._begins = stage, True
             self._best.fill_(torch.inf)
 
-    def descend(self, step: int, gradient: Tensor, judged: Tensor) -> None:
-        """Take a step down a gradient (m, p), a row a model in the parameters' order.
-
-        What is judged is the loss, (m,). The gradient is overwritten.
-        """
+    def descend(self, step: int, judged: Tensor) -> None:
+        """Take a step down `gradients`, which are overwritten; what is judged is the loss, (m,)."""
+        gradient = self._gradient
         if self._begins:  # a stage begins: what it has to be better than
             self._first = judged.clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
@@ -201,10 +210,10 @@ class GuardedAdam:
         gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm))[:, None])
         self._sum += self._last
         self._count += 1
-        before = self._flat.detach().clone() if self._slowed else None
+        before = self._flat.clone() if self._slowed else None
         self._adam(gradient)
         if before is not None:
-            self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
+            self._flat.copy_(torch.lerp(before, self._flat, self._rate[:, None]))
         if self._count == WINDOW:
             self.look(step)
 
@@ -226,7 +235,7 @@ class GuardedAdam:
         loss = self._sum / self._count
         allowed = self._best + TOLERANCE * self._best.abs().clamp_min(1.0)
         bad = ~loss.isfinite() | (loss > allowed) | (self._last > allowed)
-        bad |= ~self._flat.detach().isfinite().all(1)
+        bad |= ~self._flat.isfinite().all(1)
         bad &= ~self.failed
         self._best = torch.where(bad, self._best, torch.minimum(self._best, loss))
         self._kept = torch.where(bad, self._kept, loss)
@@ -262,22 +271,18 @@ class GuardedAdam:
     def _adam(self, gradient: Tensor) -> None:
         rate, decay = self._cycle[self._taken]
         self._taken += 1
-        adam_step(self._flat.data, gradient, self._moments, self._n_taken, rate, decay)
+        adam_step(self._flat, gradient, self._moments, self._n_taken, rate, decay)
 
     def _state(self) -> list[Tensor]:
         """Return the parameters and Adam's moments."""
-        return [self._flat.data, *self._moments]
+        return [self._flat, *self._moments]
 
-    def joined(self, tensors: Sequence[Tensor]) -> Tensor:
-        """Join tensors of the parameters' shapes to (m, p)."""
-        rows = [t.movedim(axis, 0) for t, axis in zip(tensors, self._axes, strict=True)]
-        return torch.cat([t.reshape(len(t), -1) for t in rows], dim=1)
-
-    def _make_views(self) -> None:
-        """Make the parameters views of the joined ones."""
-        at = 0
+    def _views(self, flat: Tensor) -> list[Tensor]:
+        """Return the parts of an array (m, p) in the parameters' shapes."""
+        found, at = [], 0
         for parameter, axis in zip(self._parameters, self._axes, strict=True):
             shape = parameter.detach().movedim(axis, 0).shape
             size = parameter.numel() // shape[0]
-            parameter.data = self._flat.data[:, at : at + size].view(shape).movedim(0, axis)
+            found.append(flat[:, at : at + size].view(shape).movedim(0, axis))
             at += size
+        return found

@@ -79,7 +79,7 @@ def forward(
     trace.states[0] = z
     for layer in range(len(w.rotation)):
         u, y = trace.turned[layer], trace.states[layer + 1]
-        xp.matmul(w.rotation[layer], trace.states[layer], out=u)
+        _matmul(xp, w.rotation[layer], trace.states[layer], u)
         shift, scale = _coefficients(xp, trace, w, layer, u, out, 1.0)
         y[..., :k, :] = u[..., :k, :]
         moved = y[..., k:, :]
@@ -93,17 +93,17 @@ def forward_gradient(
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of z, of the context and of R, W1, W2, from that of y."""
     k, work = w.n_kept, _working("forward gradient", xp, g, trace, w, memory)
+    work.g[-1] = g
     for layer in reversed(range(len(w.rotation))):
-        u, g_b, g_u = trace.turned[layer], work.g[..., k:, :], work.g_u
-        g_moved = g_u[..., k:, :]
+        u, g_y, g_u = trace.turned[layer], work.g[layer + 1], work.g_u[layer]
+        g_b, g_moved = g_y[..., k:, :], g_u[..., k:, :]
         xp.multiply(g_b, trace.scales[layer], out=g_moved)
-        xp.multiply(g_moved, u[..., k:, :], out=work.g_s)
-        work.g_shift[...] = g_b
-        g_seen = work.conditioner(trace, w, layer)
-        xp.add(work.g[..., :k, :], g_seen[..., :k, :], out=g_u[..., :k, :])
-        xp.matmul(g_u, trace.states[layer].swapaxes(-1, -2), out=work.g_rotation[layer])
-        xp.matmul(w.rotation[layer].swapaxes(-1, -2), g_u, out=work.g)
-    return work.g, work.g_context, (work.g_rotation, work.g_hidden, work.g_out)
+        xp.multiply(g_moved, u[..., k:, :], out=work.g_s[layer])
+        work.g_shift[layer] = g_b
+        g_seen = work.conditioner(w, layer)
+        xp.add(g_y[..., :k, :], g_seen[..., :k, :], out=g_u[..., :k, :])
+        _matmul(xp, w.rotation[layer].swapaxes(-1, -2), g_u, work.g[layer])
+    return work.g[0], work.g_context, work.weights(work.g_u, trace.states[:-1], trace)
 
 
 def inverse(
@@ -119,7 +119,7 @@ def inverse(
         moved = u[..., k:, :]
         xp.subtract(y[..., k:, :], shift, out=moved)
         moved *= shrink
-        xp.matmul(w.rotation[layer].swapaxes(-1, -2), u, out=trace.states[layer])
+        _matmul(xp, w.rotation[layer].swapaxes(-1, -2), u, trace.states[layer])
     return trace.states[0], -w.bound * trace.squashed.sum(0).sum(-2), trace
 
 
@@ -128,20 +128,19 @@ def inverse_gradient(
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of y, of the context and of R, W1, W2, from those of z and log |det|."""
     k, work = w.n_kept, _working("inverse gradient", xp, g, trace, w, memory)
+    work.g[0] = g
     for layer in range(len(w.rotation)):
-        u, g_u = trace.turned[layer], work.g_u
-        xp.matmul(u, work.g.swapaxes(-1, -2), out=work.g_rotation[layer])
-        xp.matmul(w.rotation[layer], work.g, out=g_u)
-        g_b = g_u[..., k:, :]
-        xp.multiply(g_b, u[..., k:, :], out=work.g_s)
-        work.g_s += g_log_det[..., None, :]
-        work.g_s *= -1.0
-        g_moved = work.g[..., k:, :]
+        u, g_y, g_u, g_s = trace.turned[layer], work.g[layer + 1], work.g_u[layer], work.g_s[layer]
+        _matmul(xp, w.rotation[layer], work.g[layer], g_u)
+        g_b, g_moved = g_u[..., k:, :], g_y[..., k:, :]
+        xp.multiply(g_b, u[..., k:, :], out=g_s)
+        g_s += g_log_det[..., None, :]
+        g_s *= -1.0
         xp.multiply(g_b, trace.scales[layer], out=g_moved)
-        xp.multiply(g_moved, -1.0, out=work.g_shift)
-        g_seen = work.conditioner(trace, w, layer)
-        xp.add(g_u[..., :k, :], g_seen[..., :k, :], out=work.g[..., :k, :])
-    return work.g, work.g_context, (work.g_rotation, work.g_hidden, work.g_out)
+        xp.multiply(g_moved, -1.0, out=work.g_shift[layer])
+        g_seen = work.conditioner(w, layer)
+        xp.add(g_u[..., :k, :], g_seen[..., :k, :], out=g_y[..., :k, :])
+    return work.g[-1], work.g_context, work.weights(trace.turned, work.g[:-1], trace)
 
 
 class _Work:
@@ -149,23 +148,20 @@ class _Work:
 
     def __init__(self, xp: Any, g: Array, trace: Trace, w: Weights) -> None:
         self.xp = xp
-        h, seen = w.hidden.shape[-2:]
+        n_layers, seen = len(w.rotation), w.hidden.shape[-1]
         lead, d = g.shape[:-2], g.shape[-2]
         n_moved = d - w.n_kept
-        self.g = _empty(xp, g, (*lead, d))
-        self.g_u = _empty(xp, g, (*lead, d))
-        self.g_both = _empty(xp, g, (*lead, 2 * n_moved))
+        self.g = _empty(xp, g, (n_layers + 1, *lead, d))
+        self.g_u = _empty(xp, g, (n_layers, *lead, d))
+        self.g_both = _empty(xp, g, (n_layers, *lead, 2 * n_moved))
         self.g_s, self.g_shift = self.g_both[..., :n_moved, :], self.g_both[..., n_moved:, :]
-        self.g_units, self.g_seen = _empty(xp, g, (*lead, h)), _empty(xp, g, (*lead, seen))
+        self.g_units, self.g_seen = xp.empty_like(trace.units), _empty(xp, g, (*lead, seen))
         self.g_context = _empty(xp, g, (*lead, seen - 1 - w.n_kept))
-        self.g_rotation, self.g_hidden, self.g_out = (
-            xp.empty_like(x) for x in (w.rotation, w.hidden, w.out)
-        )
         self.slopes, self.narrows = xp.empty_like(trace.units), xp.empty_like(trace.squashed)
+        self.g_weights = tuple(xp.empty_like(x) for x in (w.rotation, w.hidden, w.out))
 
-    def begin(self, g: Array, trace: Trace, w: Weights) -> None:
-        """Take in the gradient of what the pass returned."""
-        self.g[...] = g
+    def begin(self, trace: Trace, w: Weights) -> None:
+        """Take in what a pass left."""
         self.g_context[...] = 0
         # 1 - tanh^2 of the units and, with the bound, of the log-scales.
         for squares, slopes, factor in (
@@ -176,18 +172,24 @@ class _Work:
             slopes *= -factor
             slopes += factor
 
-    def conditioner(self, trace: Trace, w: Weights, layer: int) -> Array:
-        """Take the weights' gradients from those of s and t; return that of what was seen."""
-        xp = self.xp
-        self.g_s *= self.narrows[layer]
-        xp.matmul(self.g_both, trace.units[layer].swapaxes(-1, -2), out=self.g_out[layer])
-        xp.matmul(w.out[layer].swapaxes(-1, -2), self.g_both, out=self.g_units)
-        self.g_units *= self.slopes[layer]
-        xp.matmul(self.g_units, trace.seen[layer].swapaxes(-1, -2), out=self.g_hidden[layer])
-        xp.matmul(w.hidden[layer].swapaxes(-1, -2), self.g_units, out=self.g_seen)
+    def conditioner(self, w: Weights, layer: int) -> Array:
+        """Return the gradient of what was seen from those of s and t."""
+        xp, g_units = self.xp, self.g_units[layer]
+        self.g_s[layer] *= self.narrows[layer]
+        _matmul(xp, w.out[layer].swapaxes(-1, -2), self.g_both[layer], g_units)
+        g_units *= self.slopes[layer]
+        _matmul(xp, w.hidden[layer].swapaxes(-1, -2), g_units, self.g_seen)
         if self.g_context.shape[-2]:
             self.g_context += self.g_seen[..., w.n_kept : -1, :]
         return self.g_seen
+
+    def weights(self, turned: Array, still: Array, trace: Trace) -> tuple[Array, Array, Array]:
+        """Return the gradients of R, from what is (..., d, n) behind it and before, W1 and W2."""
+        g_rotation, g_hidden, g_out = self.g_weights
+        self.xp.matmul(turned, still.swapaxes(-1, -2), out=g_rotation)
+        self.xp.matmul(self.g_units, trace.seen.swapaxes(-1, -2), out=g_hidden)
+        self.xp.matmul(self.g_both, trace.units.swapaxes(-1, -2), out=g_out)
+        return g_rotation, g_hidden, g_out
 
 
 def _working(
@@ -195,7 +197,7 @@ def _working(
 ) -> _Work:
     memory = Memory() if memory is None else memory
     work: _Work = memory.take((name, g), lambda: _Work(xp, g, trace, w))
-    work.begin(g, trace, w)
+    work.begin(trace, w)
     return work
 
 
@@ -219,14 +221,21 @@ def _coefficients(
     """Fill in the trace of a layer's conditioner; return t and exp(sign s)."""
     k, units, scale = w.n_kept, trace.units[layer], trace.scales[layer]
     trace.seen[layer][..., :k, :] = state[..., :k, :]
-    xp.matmul(w.hidden[layer], trace.seen[layer], out=units)
+    _matmul(xp, w.hidden[layer], trace.seen[layer], units)
     _tanh(xp, units, units)
-    xp.matmul(w.out[layer], units, out=out)
+    _matmul(xp, w.out[layer], units, out)
     n_moved = scale.shape[-2]
     _tanh(xp, out[..., :n_moved, :], trace.squashed[layer])
     xp.multiply(trace.squashed[layer], sign * w.bound, out=scale)
     xp.exp(scale, out=scale)
     return out[..., n_moved:, :], scale
+
+
+def _matmul(xp: Any, left: Array, right: Array, out: Array) -> None:
+    if xp is np and right.ndim == 2:  # the same product, with less before it
+        np.dot(left, right, out=out)
+    else:
+        xp.matmul(left, right, out=out)
 
 
 def _tanh(xp: Any, x: Array, out: Array) -> None:

@@ -365,9 +365,7 @@ def transition_gradient(
     inverse = xp.stack(
         [own * own + precision * along * along, -2 * precision * along, precision], 1
     )
-    crosses = xp.stack(
-        [(g_mean[:, i] * u[:, j]).sum(-1) for i, j in ((0, 0), (0, 1), (1, 1))], 1
-    )
+    crosses = xp.stack([(g_mean[:, i] * u[:, j]).sum(-1) for i, j in ((0, 0), (0, 1), (1, 1))], 1)
     g_entries = _as(e.even, crosses) / 2
     g_entries[:, 1] *= 2
     g_entries -= _as(e.even, g.sum(-1))[:, None] * inverse / 2

@@ -63,10 +63,19 @@ from iflow_gym.baselines.imitation_flow.objectives import (
     tube,
 )
 from iflow_gym.baselines.imitation_flow.passes import Term, encode, evaluate
-from iflow_gym.baselines.imitation_flow.whole_step import Preparation, Weights, WholeStep
+from iflow_gym.baselines.imitation_flow.whole_step import (
+    Preparation,
+    Weights,
+    WholeStep,
+    by_hand,
+)
 
 SQUARED_ERROR_WEIGHT = 300.0
 """Weight of the squared error, against which the penalties are measured."""
+
+GROUP = 8
+"""So many models train as one batch where the step is by hand: of more, what they work on does not
+stay in a processor's cache."""
 
 N_HORIZONS = 14
 """Sampling times in a step's likelihood."""
@@ -163,19 +172,29 @@ def _one_thread() -> Iterator[None]:
 def _train(
     config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
 ) -> list[Trained | TrainingError]:
-    # What overflows is noticed by its loss.
-    with _one_thread(), np.errstate(all="ignore"):
-        return _train_batch(config, tasks, rngs)
-
-
-def _train_batch(
-    config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
-) -> list[Trained | TrainingError]:
     device = torch.device(
         ("cuda" if torch.cuda.is_available() else "cpu")
         if config.device == "auto"
         else config.device
     )
+    n_groups = 1
+    if by_hand(config, tasks[0], device):
+        n_groups = math.ceil(len(tasks) / GROUP)
+    found: list[Trained | TrainingError] = []
+    # What overflows is noticed by its loss.
+    with _one_thread(), np.errstate(all="ignore"):
+        for group in np.array_split(np.arange(len(tasks)), n_groups):
+            mine = [tasks[i] for i in group], [rngs[i] for i in group]
+            found += _train_batch(config, *mine, device)
+    return found
+
+
+def _train_batch(
+    config: ImitationFlowConfig,
+    tasks: Sequence[Task],
+    rngs: Sequence[np.random.Generator],
+    device: torch.device,
+) -> list[Trained | TrainingError]:
     generators = [torch.Generator().manual_seed(int(rng.integers(2**63))) for rng in rngs]
     batch = _Batch(config, tasks, rngs, generators, device)
     n_steps, calm = batch.resolved.n_steps, batch.watched
@@ -234,7 +253,14 @@ class _Batch:
         self._orbit: MeanOrbit | None = None
         if data.cyclic and resolved.orbit_weight > 0:
             self._orbit = MeanOrbit(tasks, data, config.orbit_resolution)
-        self._whole = _whole_step(config, self.flow, self.latent, data, self.watched, rngs)
+        self._whole: WholeStep | None = None
+        if by_hand(config, tasks[0], device):
+            assert isinstance(self.flow, CouplingFlow)
+            assert isinstance(self.latent, LinearLatent)
+            assert self._calm is not None
+            looked_at = N_HORIZONS, _n_pairs(config), self._calm.n_new
+            prepared = Preparation(config, data, rngs, *looked_at)
+            self._whole = WholeStep(self.flow, self.latent, data, self._calm, prepared, config)
         self._inward: Inward | None = None
         if data.cyclic and resolved.inward_weight > 0:
             self._inward = Inward(data)
@@ -267,8 +293,7 @@ class _Batch:
         weights = _weights(self._config, self.resolved, step, stage)
         if self._whole is not None:
             adam.begin(step, stage)
-            judged, gradients = self._whole(weights)
-            adam.descend(step, adam.joined(gradients), judged)
+            adam.descend(step, self._whole(weights, adam.gradients))
             return
         self._draws.new_step()
         terms = _terms(self._config, weights, self.latent, self.data, self._draws)
@@ -327,28 +352,6 @@ def _calm_down(
         rounds += 1
         speeds = calm.watch(batch.flow, batch.latent, N_SWEEPS)
     return Calmness(float(speeds), rounds), restarts
-
-
-def _whole_step(
-    config: ImitationFlowConfig,
-    flow: Flow,
-    latent: Latent,
-    data: Recordings,
-    calm: Calm | None,
-    rngs: Sequence[np.random.Generator],
-) -> WholeStep | None:
-    """Return the step by hand, where there is one."""
-    if (
-        calm is None
-        or data.device.type != "cpu"
-        or data.n_dims != 2
-        or data.context is not None
-        or not isinstance(flow, CouplingFlow)
-        or not isinstance(latent, LinearLatent)
-    ):
-        return None
-    prepared = Preparation(config, data, rngs, N_HORIZONS, _n_pairs(config), calm.n_new)
-    return WholeStep(flow, latent, data, calm, prepared, config)
 
 
 def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:

@@ -25,7 +25,7 @@ from iflow_gym.baselines.imitation_flow.calm import REACH as CALM_REACH
 from iflow_gym.baselines.imitation_flow.calm import Calm
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.coupling import CouplingFlow
-from iflow_gym.baselines.imitation_flow.data import Recordings
+from iflow_gym.baselines.imitation_flow.data import Recordings, Task
 from iflow_gym.baselines.imitation_flow.latent import MIN_NOISE, LinearLatent
 from iflow_gym.baselines.imitation_flow.objectives import LONGEST_HORIZON
 from iflow_gym.baselines.imitation_flow.passes import Points
@@ -48,6 +48,19 @@ class Weights(NamedTuple):
     reproduction: float
     tube: float
     calm: float
+
+
+def by_hand(config: ImitationFlowConfig, task: Task, device: torch.device) -> bool:
+    """Whether `WholeStep` is the step of such a task."""
+    return (
+        config.objective == "reproduction"
+        and config.emission == "coupling"
+        and config.resolved(cyclic=task.cyclic, n_dims=task.n_dims).calm_weight > 0
+        and not task.cyclic
+        and task.n_dims == 2
+        and not task.n_context
+        and device.type == "cpu"
+    )
 
 
 class Ahead(NamedTuple):
@@ -125,7 +138,7 @@ class Preparation:
         drift = (offset[..., None] * left[:, :, None].astype(np.float32)).reshape(
             *offset.shape[:3], -1
         )
-        far = 2 * far.reshape(*far.shape[:2], 2, -1) - 1
+        unit = 2 * far.reshape(*far.shape[:2], 2, -1) - 1
         return Ahead(
             pairs,
             horizons,
@@ -135,18 +148,16 @@ class Preparation:
             starts + offset,
             self._times(tube_samples),
             self._at_each(tube_samples) + drift,
-            self._centre + CALM_REACH * self._half * far,
+            (self._centre + CALM_REACH * self._half * unit).astype(np.float32),
         )
 
-    def _pairs(
-        self, which: Array, at: Array, first: Array
-    ) -> tuple[Array, NDArray[np.float64]]:
+    def _pairs(self, which: Array, at: Array, first: Array) -> tuple[Array, NDArray[np.float64]]:
         """Choose pairs as `objectives.random_pairs` does."""
         recordings = (which * self._lengths.shape[1]).astype(np.int64)
         lengths = np.take_along_axis(self._lengths[None], recordings, axis=2)
         longest = np.maximum(LONGEST_HORIZON * lengths, 1.0)
-        at = (np.arange(self._q) + at) / self._q
-        steps = np.minimum(np.exp(at * np.log(longest)).astype(np.int64), lengths - 1)
+        share = (np.arange(self._q) + at) / self._q
+        steps = np.minimum(np.exp(share * np.log(longest)).astype(np.int64), lengths - 1)
         room = (lengths - steps)[..., None]
         samples = np.minimum((first * room).astype(np.int64), room - 1)
         start = recordings[..., None] * self._stride + samples
@@ -210,13 +221,15 @@ class WholeStep:
         self._hidden = np.zeros((layers, m, h, seen), dtype=np.float32)
         self._hidden[..., -1, -1] = kernels.SATURATED
         self._out = np.empty((layers, m, 2, h), dtype=np.float32)
-        self._weights = kernels.Weights(
-            self._rotation, self._hidden, self._out, flow.n_kept, flow.log_scale_bound
+        self._alone = m == 1
+        rotation, hidden, out = (
+            w[:, 0] if self._alone else w for w in (self._rotation, self._hidden, self._out)
         )
+        self._weights = kernels.Weights(rotation, hidden, out, flow.n_kept, flow.log_scale_bound)
         self._memory = kernels.Memory()
 
-    def __call__(self, weights: Weights) -> tuple[Tensor, list[Tensor]]:
-        """Return the sum of the weighted terms, (m,), and the gradients of the parameters.
+    def __call__(self, weights: Weights, gradients: Sequence[Tensor]) -> Tensor:
+        """Return the sum of the weighted terms, (m,), and fill in the parameters' gradients.
 
         Those are in the order of the flow's and the latent system's parameters and in their shapes;
         in them, not in the sum, the calm counts with its own weight as well, which grows.
@@ -240,7 +253,10 @@ class WholeStep:
             asked.append(step.pairs)
         points = np.concatenate(asked, axis=-1)
         ends = np.cumsum([a.shape[-1] for a in asked]).tolist()
-        z, log_det, inverse = kernels.inverse(np, points, None, self._weights, self._memory)
+        z, log_det, inverse = kernels.inverse(
+            np, self._inside(points), None, self._weights, self._memory
+        )
+        z, log_det = self._outside(z), self._outside(log_det)
         attractor = z[..., :1]
         z = z - attractor
         g_z = np.zeros_like(z)
@@ -260,7 +276,10 @@ class WholeStep:
         exponential = planar.exponential(np, drift, np.concatenate(times, axis=-1))
         applied = planar.applied(np, exponential, states[..., None])
         reached = applied.reached[..., 0] + attractor
-        made, forward = kernels.forward(np, reached, None, self._weights, self._memory)
+        made, forward = kernels.forward(
+            np, self._inside(reached), None, self._weights, self._memory
+        )
+        made = self._outside(made)
         g_made = np.empty_like(made)
         # Losses ------------------------------------------------------------------------------
         if weights.calm:
@@ -270,9 +289,7 @@ class WholeStep:
         if weights.reproduction:
             size = step.times.shape[-1]
             error = (made[..., at : at + size] - step.target).reshape(m, 2, n, -1)
-            loss, gradient = path_error(
-                np, error, step.along.reshape(error.shape), *self._path
-            )
+            loss, gradient = path_error(np, error, step.along.reshape(error.shape), *self._path)
             total = total + weights.reproduction * loss
             g_made[..., at : at + size] = weights.reproduction * gradient.reshape(m, 2, -1)
             at += size
@@ -295,9 +312,7 @@ class WholeStep:
             )
             half = shape[2] * shape[3]
             factor = weights.likelihood / half
-            total = total - factor * (
-                made_.log_prob.sum((1, 2)) + log_det[:, at + half :].sum(1)
-            )
+            total = total - factor * (made_.log_prob.sum((1, 2)) + log_det[:, at + half :].sum(1))
             g_log_det[:, at + half :] = -factor
             g_entries, g_noise, g_before, g_after = planar.transition_gradient(
                 np, made_, np.full_like(made_.log_prob, -factor)
@@ -306,8 +321,9 @@ class WholeStep:
             g_z[..., at + half :] = g_after.reshape(m, 2, half)
         # Gradient ----------------------------------------------------------------------------
         g_reached, _, by_forward = kernels.forward_gradient(
-            np, g_made, forward, self._weights, self._memory
+            np, self._inside(g_made), forward, self._weights, self._memory
         )
+        g_reached = self._outside(g_reached)
         g_states, parts = planar.applied_gradient(np, applied, g_reached[..., None])
         g_states = g_states[..., 0]
         by_states = planar.exponential_gradient(np, exponential, *parts)
@@ -322,15 +338,25 @@ class WholeStep:
                 at, place = at + n, place + size
         g_z[..., 0] = g_reached.sum(-1) - g_z.sum(-1)
         _, _, by_inverse = kernels.inverse_gradient(
-            np, g_z, g_log_det, inverse, self._weights, self._memory
+            np,
+            self._inside(g_z),
+            self._inside(g_log_det),
+            inverse,
+            self._weights,
+            self._memory,
         )
-        by_weights = [p + q for p, q in zip(by_forward, by_inverse, strict=True)]
-        gradients = self._parameter_gradients(
-            *by_weights, planar.matrix(np, drift, 2, g_entries), lower, g_noise, noise_root
+        by_flow = (p + q for p, q in zip(by_forward, by_inverse, strict=True))
+        into = [g.numpy() for g in gradients]
+        self._fill_flow(into[:5], *by_flow)
+        g_drift, g_noise_ = (
+            planar.matrix(np, drift, 2, g_entries),
+            planar.matrix(np, drift, 1, g_noise),
         )
-        arrays = (np.asarray(x, dtype=np.float32) for x in (total, *gradients))
-        judged, *found = map(torch.from_numpy, arrays)
-        return judged, found
+        turned = g_drift.swapaxes(-1, -2)
+        into[5][...] = -((g_drift + turned) @ lower) * LOWER
+        into[6][...] = g_drift - turned
+        into[7][...] = 2 * g_noise_[:, 0] * noise_root * (noise_root - MIN_NOISE)
+        return torch.from_numpy(total.astype(np.float32, copy=False))
 
     # Parts of a step -------------------------------------------------------------------------
 
@@ -355,33 +381,26 @@ class WholeStep:
         self._out[..., -1:] = flow.out_bias.detach().numpy()
         self._out[..., 0, :] /= flow.log_scale_bound
 
-    def _parameter_gradients(
-        self,
-        g_rotation: Array,
-        g_hidden: Array,
-        g_out: Array,
-        g_drift: Array,
-        lower: Array,
-        g_noise: list[planar.Number],
-        noise_root: Array,
-    ) -> list[Array]:
-        """Take gradients of weights, A and K K^T on to the parameters, in their order."""
+    def _fill_flow(
+        self, into: Sequence[Array], g_rotation: Array, g_hidden: Array, g_out: Array
+    ) -> None:
+        """Take gradients of `kernels`' weights on to the flow's parameters."""
+        angles, hidden_weight, hidden_bias, out_weight, out_bias = into
+        if self._alone:
+            g_rotation, g_hidden, g_out = (g[:, None] for g in (g_rotation, g_hidden, g_out))
         cos, sin = self._rotation[..., 0, 0], self._rotation[..., 0, 1]
-        g_angles = (g_rotation[..., 0, 1] - g_rotation[..., 1, 0]) * cos
-        g_angles -= (g_rotation[..., 0, 0] + g_rotation[..., 1, 1]) * sin
+        angles[..., 0] = (g_rotation[..., 0, 1] - g_rotation[..., 1, 0]) * cos
+        angles[..., 0] -= (g_rotation[..., 0, 0] + g_rotation[..., 1, 1]) * sin
         g_out[..., 0, :] /= self._flow.log_scale_bound
-        turned = g_drift.swapaxes(-1, -2)
-        g_roots = np.concatenate([np.reshape(g, (-1, 1)) for g in g_noise], axis=1)
-        return [
-            g_angles[..., None],
-            g_hidden[..., :-1, :-1],
-            g_hidden[..., :-1, -1:],
-            g_out[..., :-1],
-            g_out[..., -1:],
-            -((g_drift + turned) @ lower) * LOWER,
-            g_drift - turned,
-            2 * g_roots * noise_root * (noise_root - MIN_NOISE),
-        ]
+        hidden_weight[...], hidden_bias[...] = g_hidden[..., :-1, :-1], g_hidden[..., :-1, -1:]
+        out_weight[...], out_bias[...] = g_out[..., :-1], g_out[..., -1:]
+
+    def _inside(self, x: Array) -> Array:
+        """Return an array (m, ...) as the kernels take it: a single model's products cost less."""
+        return x[0] if self._alone else x
+
+    def _outside(self, x: Array) -> Array:
+        return x[None] if self._alone else x
 
     def _far(self, step: Ahead) -> Array:
         """Return the states that the calm looks at: the fastest of before, and new ones."""

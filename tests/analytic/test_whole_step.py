@@ -54,14 +54,16 @@ def numbers_of(batch: training._Batch, config: ImitationFlowConfig, step: int) -
 def test_a_step_by_hand_is_the_step_in_torch(n_models: int, stage: int, turn: int) -> None:
     batch = batch_of(n_models)
     config, whole, calm = batch._config, batch._whole, batch.watched
-    assert whole is not None and calm is not None
+    assert whole is not None
+    assert calm is not None
     adam = batch.optimizer(TRAINED, 0.01)
     for step in range(TRAINED):  # away from the start, where half the gradients are 0
         batch.step(adam, step, training.WHOLE)
     calm.weight = torch.arange(2.0, 2.0 + n_models)
     kept, kept_excess = calm.kept, calm._kept_excess
     weights = training._weights(config, batch.resolved, turn, stage)
-    judged, gradients = whole(weights)
+    judged = whole(weights, adam.gradients)
+    gradients = [g.clone() for g in adam.gradients]
 
     calm.kept, calm._kept_excess = kept, kept_excess
     parts = numbers_of(batch, config, TRAINED)
