@@ -44,10 +44,10 @@ from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.guard import (
+    Adam,
     GuardedAdam,
     Restart,
     TrainingError,
-    adam_step,
 )
 from iflow_gym.baselines.imitation_flow.inward import N_STATES, Inward
 from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
@@ -459,11 +459,9 @@ def _fit_noise(
     with torch.no_grad():
         z = encode(flow, data, points).z.unflatten(-1, (2, NOISE_HORIZONS, NOISE_PAIRS))
     before, after = z.unbind(2)
-    # In memory of its own: a fused step takes arrays for contiguous, and this is a view of many.
     noise = latent.log_noise
-    noise.data = noise.data.clone()
-    moments, n_taken = [torch.zeros_like(noise) for _ in range(2)], noise.new_zeros(())
+    adam = Adam(noise.data)
     for _ in range(NOISE_STEPS):
         loss = -latent.transition_log_prob(before, after, times).mean((1, 2))
         (gradient,) = torch.autograd.grad(loss.sum(), noise)
-        adam_step(noise.data, gradient, moments, n_taken, NOISE_RATE, NOISE_DECAY)
+        adam.step(gradient, NOISE_RATE, NOISE_DECAY)

@@ -241,121 +241,70 @@ class WholeStep:
         drift, lower = self._drift()
         noise_root = MIN_NOISE + np.exp(self._latent.log_noise.detach().numpy())
         self._fill_weights()
-        # Inverse -----------------------------------------------------------------------------
-        m, n = len(self._goal), self._n
-        far = self._far(step) if weights.calm else self._goal[..., :0]
-        asked = [self._goal, far]
+
+        # What is asked for, by name: states, and for how long the mean dynamics take them on.
+        m = len(self._goal)
+        asked = {"goal": self._goal, "far": self._far(step)}
+        times = {"far": np.full_like(asked["far"][:, 0], self._calm.step)}
         if weights.reproduction:
-            asked.append(self._starts)
+            asked["starts"], times["starts"] = self._starts, step.times
         if weights.tube:
-            asked.append(step.beside)
+            asked["beside"], times["beside"] = step.beside, step.tube_times
         if weights.likelihood:
-            asked.append(step.pairs)
-        points = np.concatenate(asked, axis=-1)
-        ends = np.cumsum([a.shape[-1] for a in asked]).tolist()
-        z, log_det, inverse = kernels.inverse(
-            np, self._inside(points), None, self._weights, self._memory
-        )
+            asked["pairs"] = step.pairs
+        points, places = _joined(asked)
+        inside = self._inside(points)
+        z, log_det, inverse = kernels.inverse(np, inside, None, self._weights, self._memory)
         z, log_det = self._outside(z), self._outside(log_det)
-        attractor = z[..., :1]
+        attractor = z[..., places["goal"]]
         z = z - attractor
-        g_z = np.zeros_like(z)
-        g_log_det = np.zeros_like(log_det)
+        states, ends = _joined(
+            {
+                name: np.repeat(z[..., places[name]], t.shape[-1] // asked[name].shape[-1], axis=-1)
+                for name, t in times.items()
+            }
+        )
+        e = planar.exponential(np, drift, np.concatenate(list(times.values()), axis=-1))
+        applied = planar.applied(np, e, states[..., None])
+        inside = self._inside(applied.reached[..., 0] + attractor)
+        made, forward = kernels.forward(np, inside, None, self._weights, self._memory)
+
+        # Losses and their gradients, and these back the same way.
+        total, g_made = self._losses(weights, step, asked["far"], self._outside(made), ends)
+        g_z, g_log_det = np.zeros_like(z), np.zeros_like(log_det)
         g_entries: list[planar.Number] = [0.0] * 4
         g_noise: list[planar.Number] = [0.0] * 2
-        total = np.zeros(m, dtype=np.float32)
-        # Forward -----------------------------------------------------------------------------
-        n_far, at = far.shape[-1], ends[1]
-        sent, times = [z[..., 1:at]], [np.full((m, n_far), self._calm.step, dtype=np.float32)]
-        for wanted, each in ((weights.reproduction, step.times), (weights.tube, step.tube_times)):
-            if wanted:
-                sent.append(np.repeat(z[..., at : at + n], each.shape[-1] // n, axis=-1))
-                times.append(each)
-                at += n
-        states = np.concatenate(sent, axis=-1)
-        exponential = planar.exponential(np, drift, np.concatenate(times, axis=-1))
-        applied = planar.applied(np, exponential, states[..., None])
-        reached = applied.reached[..., 0] + attractor
-        made, forward = kernels.forward(
-            np, self._inside(reached), None, self._weights, self._memory
-        )
-        made = self._outside(made)
-        g_made = np.empty_like(made)
-        # Losses ------------------------------------------------------------------------------
-        if weights.calm:
-            loss, g_made[..., :n_far] = self._calm_loss(weights.calm, far, made[..., :n_far])
-            total = total + loss
-        at = n_far
-        if weights.reproduction:
-            size = step.times.shape[-1]
-            error = (made[..., at : at + size] - step.target).reshape(m, 2, n, -1)
-            loss, gradient = path_error(np, error, step.along.reshape(error.shape), *self._path)
-            total = total + weights.reproduction * loss
-            g_made[..., at : at + size] = weights.reproduction * gradient.reshape(m, 2, -1)
-            at += size
-        if weights.tube:
-            error = made[..., at:] - step.tube_target
-            factor = weights.tube / error.shape[-1]
-            total = total + factor * (error * error).sum((1, 2))
-            g_made[..., at:] = 2 * factor * error
         if weights.likelihood:
-            at, q = ends[-2], step.horizons.shape[-1]
-            before, after = np.moveaxis(z[..., at:].reshape(m, 2, 2, q, -1), 2, 0)
-            shape = before.shape
-            made_ = planar.transition(
-                np,
-                drift.astype(np.float64),
-                _diagonal(noise_root.astype(np.float64) ** 2),
-                before,
-                after,
-                step.horizons,
+            at = places["pairs"]
+            noise = _diagonal(noise_root.astype(np.float64) ** 2)
+            loss, (g_entries, g_noise), g_z[..., at], g_log_det[:, at] = self._likelihood(
+                weights.likelihood, step.horizons, drift, noise, z[..., at], log_det[:, at]
             )
-            half = shape[2] * shape[3]
-            factor = weights.likelihood / half
-            total = total - factor * (made_.log_prob.sum((1, 2)) + log_det[:, at + half :].sum(1))
-            g_log_det[:, at + half :] = -factor
-            g_entries, g_noise, g_before, g_after = planar.transition_gradient(
-                np, made_, np.full_like(made_.log_prob, -factor)
-            )
-            g_z[..., at : at + half] = g_before.reshape(m, 2, half)
-            g_z[..., at + half :] = g_after.reshape(m, 2, half)
-        # Gradient ----------------------------------------------------------------------------
+            total = total + loss
+        inside = self._inside(g_made)
         g_reached, _, by_forward = kernels.forward_gradient(
-            np, self._inside(g_made), forward, self._weights, self._memory
+            np, inside, forward, self._weights, self._memory
         )
         g_reached = self._outside(g_reached)
         g_states, parts = planar.applied_gradient(np, applied, g_reached[..., None])
-        g_states = g_states[..., 0]
-        by_states = planar.exponential_gradient(np, exponential, *parts)
+        by_states = planar.exponential_gradient(np, e, *parts)
         g_entries = [p + q for p, q in zip(g_entries, by_states, strict=True)]
-        g_z[..., 1 : ends[1]] = g_states[..., :n_far]
-        at, place = ends[1], n_far
-        for wanted, each in ((weights.reproduction, step.times), (weights.tube, step.tube_times)):
-            if wanted:
-                size = each.shape[-1]
-                shares = g_states[..., place : place + size].reshape(m, 2, n, -1)
-                g_z[..., at : at + n] = shares.sum(-1)
-                at, place = at + n, place + size
-        g_z[..., 0] = g_reached.sum(-1) - g_z.sum(-1)
+        for name, end in ends.items():
+            shares = g_states[..., end, 0].reshape(m, 2, asked[name].shape[-1], -1)
+            g_z[..., places[name]] = shares.sum(-1)
+        g_z[..., 0] = g_reached.sum(-1) - g_z.sum(-1)  # of the attractor
+        inside, g_det = self._inside(g_z), self._inside(g_log_det)
         _, _, by_inverse = kernels.inverse_gradient(
-            np,
-            self._inside(g_z),
-            self._inside(g_log_det),
-            inverse,
-            self._weights,
-            self._memory,
+            np, inside, g_det, inverse, self._weights, self._memory
         )
-        by_flow = (p + q for p, q in zip(by_forward, by_inverse, strict=True))
-        into = [g.numpy() for g in gradients]
-        self._fill_flow(into[:5], *by_flow)
-        g_drift, g_noise_ = (
-            planar.matrix(np, drift, 2, g_entries),
-            planar.matrix(np, drift, 1, g_noise),
-        )
+        *of_flow, factor, skew, log_noise = (g.numpy() for g in gradients)
+        self._fill_flow(of_flow, *(p + q for p, q in zip(by_forward, by_inverse, strict=True)))
+        g_drift = planar.matrix(np, drift, 2, g_entries)
         turned = g_drift.swapaxes(-1, -2)
-        into[5][...] = -((g_drift + turned) @ lower) * LOWER
-        into[6][...] = g_drift - turned
-        into[7][...] = 2 * g_noise_[:, 0] * noise_root * (noise_root - MIN_NOISE)
+        factor[...] = -((g_drift + turned) @ lower) * LOWER
+        skew[...] = g_drift - turned
+        g_squares = planar.matrix(np, drift, 1, g_noise)[:, 0]
+        log_noise[...] = 2 * g_squares * noise_root * (noise_root - MIN_NOISE)
         return torch.from_numpy(total.astype(np.float32, copy=False))
 
     # Parts of a step -------------------------------------------------------------------------
@@ -407,6 +356,54 @@ class WholeStep:
         kept = self._calm.kept
         return step.far if kept is None else np.concatenate([kept.states, step.far], axis=-1)
 
+    def _losses(
+        self, weights: Weights, step: Ahead, far: Array, made: Array, ends: dict[str, slice]
+    ) -> tuple[Array, Array]:
+        """Return the weighted losses of what is made, (m,), and its gradient."""
+        gradient = np.empty_like(made)
+        total, gradient[..., ends["far"]] = self._calm_loss(
+            weights.calm, far, made[..., ends["far"]]
+        )
+        if weights.reproduction:
+            at = ends["starts"]
+            error = (made[..., at] - step.target).reshape(*made.shape[:2], self._n, -1)
+            loss, g_error = path_error(np, error, step.along.reshape(error.shape), *self._path)
+            total = total + weights.reproduction * loss
+            gradient[..., at] = weights.reproduction * g_error.reshape(*made.shape[:2], -1)
+        if weights.tube:
+            error = made[..., ends["beside"]] - step.tube_target
+            factor = weights.tube / error.shape[-1]
+            total = total + factor * (error * error).sum((1, 2))
+            gradient[..., ends["beside"]] = 2 * factor * error
+        return total, gradient
+
+    def _likelihood(
+        self,
+        weight: float,
+        horizons: NDArray[np.float64],
+        drift: Array,
+        noise: NDArray[np.float64],
+        z: Array,
+        log_det: Array,
+    ) -> tuple[Array, tuple[list[planar.Number], list[planar.Number]], Array, Array]:
+        """Return the weighted term of pairs z (m, 2, 2 q p), (m,), and its gradients.
+
+        Those of the entries of A and of the noise, of z and of its log-determinants.
+        """
+        m, q = horizons.shape
+        before, after = np.moveaxis(z.reshape(m, 2, 2, q, -1), 2, 0)
+        made = planar.transition(np, drift.astype(np.float64), noise, before, after, horizons)
+        half = before[0, 0].size
+        factor = weight / half
+        loss = -factor * (made.log_prob.sum((1, 2)) + log_det[:, half:].sum(1))
+        *by_latent, g_before, g_after = planar.transition_gradient(
+            np, made, np.full_like(made.log_prob, -factor)
+        )
+        g_z = np.concatenate([g.reshape(m, 2, half) for g in (g_before, g_after)], axis=-1)
+        g_log_det = np.zeros_like(log_det)
+        g_log_det[:, half:] = -factor
+        return loss, (by_latent[0], by_latent[1]), g_z, g_log_det
+
     def _calm_loss(self, weight: float, y: Array, moved: Array) -> tuple[Array, Array]:
         """Return the weighted penalty of `calm.Calm`, (m,), and the gradient of what is moved.
 
@@ -426,6 +423,13 @@ class WholeStep:
         factor = 2 * weight / excess.shape[1] * calm.weight.numpy()[:, None]
         g_v = (factor * above / squares)[:, None] * v
         return loss, self._frame.swapaxes(-1, -2) @ g_v / unit
+
+
+def _joined(parts: dict[str, Array]) -> tuple[Array, dict[str, slice]]:
+    """Join arrays along their last axis; return where each is."""
+    ends = np.cumsum([part.shape[-1] for part in parts.values()]).tolist()
+    slices = [slice(first, end) for first, end in zip([0, *ends], ends, strict=False)]
+    return np.concatenate(list(parts.values()), axis=-1), dict(zip(parts, slices, strict=True))
 
 
 def _diagonal(squares: NDArray[np.float64]) -> NDArray[np.float64]:
