@@ -26,31 +26,88 @@ Array = Any
 """A NumPy array or a torch tensor."""
 
 
-class Weights(NamedTuple):
-    """What the chain is made of, and how it is cut."""
+class LayerWeights(NamedTuple):
+    """A layer's weights, and views of them on their sides."""
 
     rotation: Array
+    rotation_t: Array
     hidden: Array
+    hidden_t: Array
     out: Array
-    n_kept: int
-    bound: float
+    out_t: Array
 
 
-class Trace(NamedTuple):
-    """What a pass leaves for its gradient, by layer."""
+class Weights:
+    """What the chain is made of, and how it is cut.
 
-    states: Array
-    """(layers + 1, ..., d, n): before and after each layer."""
+    Parameters
+    ----------
+    rotation, hidden, out : arrays
+        R, W1 and W2.
+    n_kept : int
+        Size of u_a.
+    bound : float
+        b.
+    """
+
+    def __init__(
+        self, rotation: Array, hidden: Array, out: Array, n_kept: int, bound: float
+    ) -> None:
+        self.rotation, self.hidden, self.out = rotation, hidden, out
+        self.n_kept, self.bound = n_kept, bound
+        sides = [(w, w.swapaxes(-1, -2)) for w in (rotation, hidden, out)]
+        self.layers = [
+            LayerWeights(*w) for w in zip(*(x for pair in sides for x in pair), strict=True)
+        ]
+
+
+class Layer(NamedTuple):
+    """What a pass leaves of one layer; those that are parts of others are views of them."""
+
+    before: Array
+    """(..., d, n), and so are the next two."""
     turned: Array
-    """(layers, ..., d, n): between the transform and the coupling."""
+    """Between the transform and the coupling."""
+    after: Array
+    turned_kept: Array
+    turned_moved: Array
+    after_kept: Array
+    after_moved: Array
     seen: Array
-    """(layers, ..., seen + 1, n): the conditioner's input."""
+    """(..., seen + 1, n): the conditioner's input."""
+    seen_kept: Array
     units: Array
-    """(layers, ..., h + 1, n)."""
+    """(..., h + 1, n)."""
     squashed: Array
-    """(layers, ..., moved, n): tanh(s^ / b)."""
+    """(..., moved, n): tanh(s^ / b)."""
     scales: Array
-    """(layers, ..., moved, n): exp(s), or exp(-s) of the inverse."""
+    """(..., moved, n): exp(s), or exp(-s) of the inverse."""
+
+
+class Trace:
+    """What a pass leaves for its gradient, in arrays that lead with the layer."""
+
+    def __init__(self, xp: Any, like: Array, w: Weights) -> None:
+        n_layers, (d, _) = len(w.layers), like.shape[-2:]
+        lead, k = (n_layers, *like.shape[:-2]), w.n_kept
+        h, n_seen = w.hidden.shape[-2:]
+        self.states = _empty(xp, like, (n_layers + 1, *like.shape[:-2], d))
+        self.turned = _empty(xp, like, (*lead, d))
+        self.seen = _empty(xp, like, (*lead, n_seen))
+        self.seen[..., -1, :] = 1
+        self.units = _empty(xp, like, (*lead, h))
+        self.squashed, self.scales = (_empty(xp, like, (*lead, d - k)) for _ in range(2))
+        # The conditioner's output: what goes into tanh, and t.
+        out = _empty(xp, like, (*like.shape[:-2], 2 * (d - k)))
+        self.out, self.narrowed, self.shift = out, out[..., : d - k, :], out[..., d - k :, :]
+        before, after = self.states[:-1], self.states[1:]
+        parts = (
+            before, self.turned, after,
+            self.turned[..., :k, :], self.turned[..., k:, :],
+            after[..., :k, :], after[..., k:, :],
+            self.seen, self.seen[..., :k, :], self.units, self.squashed, self.scales,
+        )  # fmt: skip
+        self.layers = [Layer(*layer) for layer in zip(*parts, strict=True)]
 
 
 class Memory:
@@ -75,16 +132,15 @@ def forward(
     xp: Any, z: Array, context: Array | None, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Trace]:
     """Return y = h(z), (..., d, n), and the trace."""
-    k, trace, out = w.n_kept, *_begun("forward", xp, z, context, w, memory)
+    trace = _begun("forward", xp, z, context, w, memory)
     trace.states[0] = z
-    for layer in range(len(w.rotation)):
-        u, y = trace.turned[layer], trace.states[layer + 1]
-        _matmul(xp, w.rotation[layer], trace.states[layer], u)
-        shift, scale = _coefficients(xp, trace, w, layer, u, out, 1.0)
-        y[..., :k, :] = u[..., :k, :]
-        moved = y[..., k:, :]
-        xp.multiply(u[..., k:, :], scale, out=moved)
-        moved += shift
+    for layer, weights in zip(trace.layers, w.layers, strict=True):
+        _matmul(xp, weights.rotation, layer.before, layer.turned)
+        layer.seen_kept[...] = layer.turned_kept
+        _conditioned(xp, trace, layer, weights, w.bound)
+        layer.after_kept[...] = layer.turned_kept
+        xp.multiply(layer.turned_moved, layer.scales, out=layer.after_moved)
+        xp.add(layer.after_moved, trace.shift, out=layer.after_moved)
     return trace.states[-1], trace
 
 
@@ -92,34 +148,33 @@ def forward_gradient(
     xp: Any, g: Array, trace: Trace, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of z, of the context and of R, W1, W2, from that of y."""
-    k, work = w.n_kept, _working("forward gradient", xp, g, trace, w, memory)
-    work.g[-1] = g
-    for layer in reversed(range(len(w.rotation))):
-        u, g_y, g_u = trace.turned[layer], work.g[layer + 1], work.g_u[layer]
-        g_b, g_moved = g_y[..., k:, :], g_u[..., k:, :]
-        xp.multiply(g_b, trace.scales[layer], out=g_moved)
-        xp.multiply(g_moved, u[..., k:, :], out=work.g_s[layer])
-        work.g_shift[layer] = g_b
-        g_seen = work.conditioner(w, layer)
-        xp.add(g_y[..., :k, :], g_seen[..., :k, :], out=g_u[..., :k, :])
-        _matmul(xp, w.rotation[layer].swapaxes(-1, -2), g_u, work.g[layer])
-    return work.g[0], work.g_context, work.weights(work.g_u, trace.states[:-1], trace)
+    work = _working("forward gradient", xp, g, trace, w, memory)
+    work.states[-1] = g
+    for layer, own, weights in zip(
+        trace.layers[::-1], work.layers[::-1], w.layers[::-1], strict=True
+    ):
+        xp.multiply(own.after_moved, layer.scales, out=own.turned_moved)
+        xp.multiply(own.turned_moved, layer.turned_moved, out=own.log_scale)
+        own.shift[...] = own.after_moved
+        work.conditioner(own, weights)
+        xp.add(own.after_kept, work.seen_kept, out=own.turned_kept)
+        _matmul(xp, weights.rotation_t, own.turned, own.before)
+    return work.states[0], work.context, work.weights(work.turned, trace.states[:-1], trace)
 
 
 def inverse(
     xp: Any, y: Array, context: Array | None, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Array, Trace]:
     """Return z = h^-1(y), (..., d, n), log |det dz/dy|, (..., n), and the trace."""
-    k, trace, out = w.n_kept, *_begun("inverse", xp, y, context, w, memory)
+    trace = _begun("inverse", xp, y, context, w, memory)
     trace.states[-1] = y
-    for layer in reversed(range(len(w.rotation))):
-        u, y = trace.turned[layer], trace.states[layer + 1]
-        shift, shrink = _coefficients(xp, trace, w, layer, y, out, -1.0)
-        u[..., :k, :] = y[..., :k, :]
-        moved = u[..., k:, :]
-        xp.subtract(y[..., k:, :], shift, out=moved)
-        moved *= shrink
-        _matmul(xp, w.rotation[layer].swapaxes(-1, -2), u, trace.states[layer])
+    for layer, weights in zip(trace.layers[::-1], w.layers[::-1], strict=True):
+        layer.seen_kept[...] = layer.after_kept
+        _conditioned(xp, trace, layer, weights, -w.bound)
+        layer.turned_kept[...] = layer.after_kept
+        xp.subtract(layer.after_moved, trace.shift, out=layer.turned_moved)
+        xp.multiply(layer.turned_moved, layer.scales, out=layer.turned_moved)
+        _matmul(xp, weights.rotation_t, layer.turned, layer.before)
     return trace.states[0], -w.bound * trace.squashed.sum(0).sum(-2), trace
 
 
@@ -127,20 +182,39 @@ def inverse_gradient(
     xp: Any, g: Array, g_log_det: Array, trace: Trace, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of y, of the context and of R, W1, W2, from those of z and log |det|."""
-    k, work = w.n_kept, _working("inverse gradient", xp, g, trace, w, memory)
-    work.g[0] = g
-    for layer in range(len(w.rotation)):
-        u, g_y, g_u, g_s = trace.turned[layer], work.g[layer + 1], work.g_u[layer], work.g_s[layer]
-        _matmul(xp, w.rotation[layer], work.g[layer], g_u)
-        g_b, g_moved = g_u[..., k:, :], g_y[..., k:, :]
-        xp.multiply(g_b, u[..., k:, :], out=g_s)
-        g_s += g_log_det[..., None, :]
-        g_s *= -1.0
-        xp.multiply(g_b, trace.scales[layer], out=g_moved)
-        xp.multiply(g_moved, -1.0, out=work.g_shift[layer])
-        g_seen = work.conditioner(w, layer)
-        xp.add(g_u[..., :k, :], g_seen[..., :k, :], out=g_y[..., :k, :])
-    return work.g[-1], work.g_context, work.weights(trace.turned, work.g[:-1], trace)
+    work = _working("inverse gradient", xp, g, trace, w, memory)
+    work.states[0] = g
+    log_det = g_log_det[..., None, :]
+    for layer, own, weights in zip(trace.layers, work.layers, w.layers, strict=True):
+        _matmul(xp, weights.rotation, own.before, own.turned)
+        xp.multiply(own.turned_moved, layer.turned_moved, out=own.log_scale)
+        xp.add(own.log_scale, log_det, out=own.log_scale)
+        xp.negative(own.log_scale, out=own.log_scale)
+        xp.multiply(own.turned_moved, layer.scales, out=own.after_moved)
+        xp.negative(own.after_moved, out=own.shift)
+        work.conditioner(own, weights)
+        xp.add(own.turned_kept, work.seen_kept, out=own.after_kept)
+    return work.states[-1], work.context, work.weights(trace.turned, work.states[:-1], trace)
+
+
+class LayerWork(NamedTuple):
+    """Gradients of what a `Layer` has, and slopes."""
+
+    before: Array
+    turned: Array
+    turned_kept: Array
+    turned_moved: Array
+    after_kept: Array
+    after_moved: Array
+    both: Array
+    """Of what the conditioner returns: the next two."""
+    log_scale: Array
+    shift: Array
+    units: Array
+    slope: Array
+    """1 - tanh^2 of the units."""
+    narrow: Array
+    """b (1 - tanh^2) of the log-scales."""
 
 
 class _Work:
@@ -148,22 +222,30 @@ class _Work:
 
     def __init__(self, xp: Any, g: Array, trace: Trace, w: Weights) -> None:
         self.xp = xp
-        n_layers, seen = len(w.rotation), w.hidden.shape[-1]
+        n_layers, n_seen, k = len(w.layers), w.hidden.shape[-1], w.n_kept
         lead, d = g.shape[:-2], g.shape[-2]
-        n_moved = d - w.n_kept
-        self.g = _empty(xp, g, (n_layers + 1, *lead, d))
-        self.g_u = _empty(xp, g, (n_layers, *lead, d))
-        self.g_both = _empty(xp, g, (n_layers, *lead, 2 * n_moved))
-        self.g_s, self.g_shift = self.g_both[..., :n_moved, :], self.g_both[..., n_moved:, :]
-        self.g_units, self.g_seen = xp.empty_like(trace.units), _empty(xp, g, (*lead, seen))
-        self.g_context = _empty(xp, g, (*lead, seen - 1 - w.n_kept))
-        self.slopes, self.narrows = xp.empty_like(trace.units), xp.empty_like(trace.squashed)
+        self.states = _empty(xp, g, (n_layers + 1, *lead, d))
+        self.turned = _empty(xp, g, (n_layers, *lead, d))
+        self.both = _empty(xp, g, (n_layers, *lead, 2 * (d - k)))
+        self.units, self.slopes = (xp.empty_like(trace.units) for _ in range(2))
+        self.narrows = xp.empty_like(trace.squashed)
+        self.seen = _empty(xp, g, (*lead, n_seen))
+        self.seen_kept, self.seen_context = self.seen[..., :k, :], self.seen[..., k:-1, :]
+        self.context = xp.zeros_like(self.seen_context)
         self.g_weights = tuple(xp.empty_like(x) for x in (w.rotation, w.hidden, w.out))
+        before, after = self.states[:-1], self.states[1:]
+        parts = (
+            before, self.turned,
+            self.turned[..., :k, :], self.turned[..., k:, :],
+            after[..., :k, :], after[..., k:, :],
+            self.both, self.both[..., : d - k, :], self.both[..., d - k :, :],
+            self.units, self.slopes, self.narrows,
+        )  # fmt: skip
+        self.layers = [LayerWork(*layer) for layer in zip(*parts, strict=True)]
 
     def begin(self, trace: Trace, w: Weights) -> None:
         """Take in what a pass left."""
-        self.g_context[...] = 0
-        # 1 - tanh^2 of the units and, with the bound, of the log-scales.
+        self.context[...] = 0
         for squares, slopes, factor in (
             (trace.units, self.slopes, 1.0),
             (trace.squashed, self.narrows, w.bound),
@@ -172,23 +254,22 @@ class _Work:
             slopes *= -factor
             slopes += factor
 
-    def conditioner(self, w: Weights, layer: int) -> Array:
-        """Return the gradient of what was seen from those of s and t."""
-        xp, g_units = self.xp, self.g_units[layer]
-        self.g_s[layer] *= self.narrows[layer]
-        _matmul(xp, w.out[layer].swapaxes(-1, -2), self.g_both[layer], g_units)
-        g_units *= self.slopes[layer]
-        _matmul(xp, w.hidden[layer].swapaxes(-1, -2), g_units, self.g_seen)
-        if self.g_context.shape[-2]:
-            self.g_context += self.g_seen[..., w.n_kept : -1, :]
-        return self.g_seen
+    def conditioner(self, own: LayerWork, weights: LayerWeights) -> None:
+        """Take the gradients of s and t on to what was seen."""
+        xp = self.xp
+        xp.multiply(own.log_scale, own.narrow, out=own.log_scale)
+        _matmul(xp, weights.out_t, own.both, own.units)
+        xp.multiply(own.units, own.slope, out=own.units)
+        _matmul(xp, weights.hidden_t, own.units, self.seen)
+        if self.context.shape[-2]:
+            self.context += self.seen_context
 
     def weights(self, turned: Array, still: Array, trace: Trace) -> tuple[Array, Array, Array]:
         """Return the gradients of R, from what is (..., d, n) behind it and before, W1 and W2."""
         g_rotation, g_hidden, g_out = self.g_weights
         self.xp.matmul(turned, still.swapaxes(-1, -2), out=g_rotation)
-        self.xp.matmul(self.g_units, trace.seen.swapaxes(-1, -2), out=g_hidden)
-        self.xp.matmul(self.g_both, trace.units.swapaxes(-1, -2), out=g_out)
+        self.xp.matmul(self.units, trace.seen.swapaxes(-1, -2), out=g_hidden)
+        self.xp.matmul(self.both, trace.units.swapaxes(-1, -2), out=g_out)
         return g_rotation, g_hidden, g_out
 
 
@@ -203,32 +284,23 @@ def _working(
 
 def _begun(
     name: str, xp: Any, state: Array, context: Array | None, w: Weights, memory: Memory | None
-) -> tuple[Trace, Array]:
-    """Return an empty trace of a pass, and what the conditioners' outputs go to."""
+) -> Trace:
+    """Return a pass's trace, with nothing but its context in it."""
     memory = Memory() if memory is None else memory
-    made: tuple[Trace, Array] = memory.take(
-        (name, state),
-        lambda: (_empty_trace(xp, state, w), _empty(xp, state, w.out.shape[1:-1])),
-    )
+    trace: Trace = memory.take((name, state), lambda: Trace(xp, state, w))
     if context is not None:
-        made[0].seen[..., w.n_kept : -1, :] = context
-    return made
+        trace.seen[..., w.n_kept : -1, :] = context
+    return trace
 
 
-def _coefficients(
-    xp: Any, trace: Trace, w: Weights, layer: int, state: Array, out: Array, sign: float
-) -> tuple[Array, Array]:
-    """Fill in the trace of a layer's conditioner; return t and exp(sign s)."""
-    k, units, scale = w.n_kept, trace.units[layer], trace.scales[layer]
-    trace.seen[layer][..., :k, :] = state[..., :k, :]
-    _matmul(xp, w.hidden[layer], trace.seen[layer], units)
-    _tanh(xp, units, units)
-    _matmul(xp, w.out[layer], units, out)
-    n_moved = scale.shape[-2]
-    _tanh(xp, out[..., :n_moved, :], trace.squashed[layer])
-    xp.multiply(trace.squashed[layer], sign * w.bound, out=scale)
-    xp.exp(scale, out=scale)
-    return out[..., n_moved:, :], scale
+def _conditioned(xp: Any, trace: Trace, layer: Layer, weights: LayerWeights, bound: float) -> None:
+    """Fill in what a layer's conditioner makes of what it sees: exp(+-s) and t."""
+    _matmul(xp, weights.hidden, layer.seen, layer.units)
+    _tanh(xp, layer.units, layer.units)
+    _matmul(xp, weights.out, layer.units, trace.out)
+    _tanh(xp, trace.narrowed, layer.squashed)
+    xp.multiply(layer.squashed, bound, out=layer.scales)
+    xp.exp(layer.scales, out=layer.scales)
 
 
 def _matmul(xp: Any, left: Array, right: Array, out: Array) -> None:
@@ -253,19 +325,3 @@ def _empty(xp: Any, like: Array, lead: tuple[int, ...]) -> Array:
     if xp is np:
         return np.empty(shape, dtype=like.dtype)
     return xp.empty(shape, dtype=like.dtype, device=like.device)
-
-
-def _empty_trace(xp: Any, z: Array, w: Weights) -> Trace:
-    n_layers, (d, _) = len(w.rotation), z.shape[-2:]
-    lead, (h, n_seen) = (n_layers, *z.shape[:-2]), w.hidden.shape[-2:]
-    n_moved = d - w.n_kept
-    seen = _empty(xp, z, (*lead, n_seen))
-    seen[..., -1, :] = 1
-    return Trace(
-        _empty(xp, z, (n_layers + 1, *z.shape[:-2], d)),
-        _empty(xp, z, (*lead, d)),
-        seen,
-        _empty(xp, z, (*lead, h)),
-        _empty(xp, z, (*lead, n_moved)),
-        _empty(xp, z, (*lead, n_moved)),
-    )
