@@ -87,9 +87,9 @@ class Calm:
     """
 
     def __init__(self, data: Recordings, sampling: Sampling, limit: float) -> None:
-        self._data, self._n_new, self._limit = data, sampling.n_points // 2, limit
-        self._step = sampling.step
-        self._kept: Points | None = None
+        self._data, self.n_new, self.limit = data, sampling.n_points // 2, limit
+        self.step = sampling.step
+        self.kept: Points | None = None
         self._kept_excess = data.peak_speed[:, :0]
         self._n_sweeps = 0
         self.raised = False
@@ -98,13 +98,13 @@ class Calm:
     def __call__(self, draws: Draws) -> Term:
         """Return the term of one step."""
         data = self._data
-        uniform = draws.uniform(data.n_dims, self._n_new)
-        among = (draws.uniform(self._n_new) * data.n_recordings).long()
+        uniform = draws.uniform(data.n_dims, self.n_new)
+        among = (draws.uniform(self.n_new) * data.n_recordings).long()
         points = Points(data.centre + REACH * data.half * (2 * uniform - 1), among)
-        if self._kept is not None:
-            points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
+        if self.kept is not None:
+            points = Points(*(torch.cat(pair, -1) for pair in zip(self.kept, points, strict=True)))
         excess = yield from self._excess(points)
-        self._keep(points, excess.detach())
+        self.keep(points, excess.detach())
         return torch.relu(excess).square().mean(1)
 
     def sweep(self, flow: Flow, latent: Latent) -> Tensor:
@@ -116,12 +116,12 @@ class Calm:
         points = self._lattice()
         with torch.no_grad():
             (excess,) = evaluate(flow, latent, self._data, [self._excess(points)])
-        if self._kept is not None:
-            points = Points(*(torch.cat(pair, -1) for pair in zip(self._kept, points, strict=True)))
-            self._keep(points, torch.cat([self._kept_excess, excess], -1))
+        if self.kept is not None:
+            points = Points(*(torch.cat(pair, -1) for pair in zip(self.kept, points, strict=True)))
+            self.keep(points, torch.cat([self._kept_excess, excess], -1))
         else:
-            self._keep(points, excess)
-        return self._limit * torch.exp(excess.amax(1))
+            self.keep(points, excess)
+        return self.limit * torch.exp(excess.amax(1))
 
     def watch(self, flow: Flow, latent: Latent, n_sweeps: int = 1) -> Tensor:
         """Sweep, double the weight of models that are loud and halve that of others.
@@ -139,11 +139,11 @@ class Calm:
         """Return which models are too fast somewhere, (m,), by their fastest speeds."""
         return speeds > LOUD
 
-    def _keep(self, points: Points, excess: Tensor) -> None:
+    def keep(self, points: Points, excess: Tensor) -> None:
         """Keep the fastest of points, with their excess (m, q), for the next step."""
         y, among = points
-        self._kept_excess, fastest = excess.topk(self._n_new, dim=1)
-        self._kept = Points(
+        self._kept_excess, fastest = excess.topk(self.n_new, dim=1)
+        self.kept = Points(
             torch.gather(y, 2, fastest[:, None].expand(-1, y.shape[1], -1)),
             torch.gather(among, 1, fastest),
         )
@@ -153,8 +153,8 @@ class Calm:
         data = self._data
         z, _ = yield points
         y, among = points
-        moved = yield Starts(z, z.new_full(among.shape, self._step), among)
-        unit = self._step * self._limit * data.peak_speed
+        moved = yield Starts(z, z.new_full(among.shape, self.step), among)
+        unit = self.step * self.limit * data.peak_speed
         speed = (torch.bmm(data.frame, moved - y) / unit[..., None]).square().sum(1)
         return torch.log(speed.add(1e-12)) / 2
 

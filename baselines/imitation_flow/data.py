@@ -174,6 +174,8 @@ class Recordings:
         The frames' matrices.
     peak_speed : Tensor, shape (m, 1)
         The recordings' greatest speed, in length per unit of time.
+    flat : Tensor, shape (m, d, n stride)
+        All samples, those of a recording from a multiple of `stride` on.
     """
 
     def __init__(self, tasks: Sequence[Task], device: torch.device) -> None:
@@ -182,8 +184,8 @@ class Recordings:
         self.n_dims, self.cyclic, self.device = tasks[0].n_dims, tasks[0].cyclic, device
         shown = [task.scaled(frame) for task, frame in zip(tasks, frames, strict=True)]
         lengths = np.array([[len(p) for p in paths] for paths in shown])
-        self._stride = int(lengths.max())
-        padded = np.zeros((*lengths.shape, self._stride, self.n_dims), dtype=np.float32)
+        self.stride = int(lengths.max())
+        padded = np.zeros((*lengths.shape, self.stride, self.n_dims), dtype=np.float32)
         for m, paths in enumerate(shown):
             for i, path in enumerate(paths):
                 padded[m, i, : len(path)] = path
@@ -195,7 +197,7 @@ class Recordings:
         self.lengths = torch.as_tensor(lengths, device=device)
         self.steps = tensor([t.steps(f) for t, f in zip(tasks, frames, strict=True)])
         self.peak_speed, self.frame = tensor(speeds), tensor([f.matrix for f in frames])
-        self._flat = tensor(np.moveaxis(padded, 3, 1)).flatten(2).contiguous()
+        self.flat = tensor(np.moveaxis(padded, 3, 1)).flatten(2).contiguous()
         low = tensor([np.concatenate(paths).min(0) for paths in shown])[..., None]
         high = tensor([np.concatenate(paths).max(0) for paths in shown])[..., None]
         self.centre, self.half = (low + high) / 2, (high - low) / 2
@@ -205,8 +207,8 @@ class Recordings:
 
     def at(self, recordings: Tensor, samples: Tensor) -> Tensor:
         """Positions, shape (m, d, q), of samples (m, q) of recordings (m, q)."""
-        index = recordings * self._stride + samples
-        return torch.gather(self._flat, 2, index[:, None].expand(-1, self.n_dims, -1))
+        index = recordings * self.stride + samples
+        return torch.gather(self.flat, 2, index[:, None].expand(-1, self.n_dims, -1))
 
     def context_of(self, recordings: Tensor) -> Tensor | None:
         """Contexts, shape (m, k, q), of recordings (m, q)."""

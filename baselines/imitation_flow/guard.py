@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam
 
 WINDOW = 25
 """Steps between two looks."""
@@ -95,21 +94,25 @@ def one_cycle(peak: float, n_steps: int) -> list[tuple[float, float]]:
     return found
 
 
-def adam_step(
-    parameters: Tensor,
-    gradient: Tensor,
-    moments: Sequence[Tensor],
-    n_taken: Tensor,
-    rate: float,
-    decay: float,
-) -> None:
-    """Take Adam's step in place, on contiguous arrays: torch's function without its optimizer."""
-    mean, square = moments
-    adam(
-        [parameters], [gradient], [mean], [square], [], [n_taken],
-        fused=True, amsgrad=False, maximize=False,
-        beta1=decay, beta2=BETA, lr=rate, weight_decay=0.0, eps=EPSILON,
-    )  # fmt: skip
+class Adam:
+    """Adam's moments of an array (Kingma and Ba, "Adam", 2015), and its step in place.
+
+    A dozen small operations: torch's own takes longer to find out what it is given.
+    """
+
+    def __init__(self, parameters: Tensor) -> None:
+        self.parameters = parameters
+        self.mean, self.square = (torch.zeros_like(parameters) for _ in range(2))
+        self._mean_share = self._square_share = 1.0
+
+    def step(self, gradient: Tensor, rate: float, decay: float) -> None:
+        """Take a step down a gradient, with a first decay of its own."""
+        self._mean_share *= decay
+        self._square_share *= BETA
+        self.mean.lerp_(gradient, 1 - decay)
+        self.square.mul_(BETA).addcmul_(gradient, gradient, value=1 - BETA)
+        size = self.square.sqrt().div_(math.sqrt(1 - self._square_share)).add_(EPSILON)
+        self.parameters.addcdiv_(self.mean, size, value=-rate / (1 - self._mean_share))
 
 
 class GuardedAdam:
@@ -134,6 +137,8 @@ class GuardedAdam:
         Models that do not train on, and why.
     failed : Tensor of bool, shape (m,)
         Which these are.
+    gradients : list of Tensor
+        What `descend` goes down, in the parameters' shapes: views of one array (m, p).
     """
 
     def __init__(
@@ -147,12 +152,17 @@ class GuardedAdam:
     ) -> None:
         self._names, self._max_norm = list(names), max_norm
         self._parameters, self._axes = zip(*parameters, strict=True)
-        self._flat = nn.Parameter(self._joined([p.detach() for p in self._parameters]))
-        self._make_views()
-        self._moments = [torch.zeros_like(self._flat.data) for _ in range(2)]
-        self._n_taken = torch.zeros((), dtype=torch.float32, device=self._flat.device)
+        n_models = self._parameters[0].shape[self._axes[0]]
+        size = sum(p.numel() for p in self._parameters) // n_models
+        first = self._parameters[0].detach()
+        self._flat, self._gradient = (first.new_empty(n_models, size) for _ in range(2))
+        self.gradients = self._views(self._gradient)
+        for parameter, view in zip(self._parameters, self._views(self._flat), strict=True):
+            view.copy_(parameter.detach())
+            parameter.data = view
+        self._adam = Adam(self._flat)
         self._cycle, self._taken = one_cycle(learning_rate, n_steps), 0
-        like = self._flat.detach()[:, 0]
+        like = self._flat[:, 0]
         self._rate, self._sum = torch.ones_like(like), torch.zeros_like(like)
         self._best, self._kept = torch.full_like(like, torch.inf), torch.full_like(like, torch.inf)
         self._first = self._last = torch.zeros_like(like)
@@ -168,20 +178,31 @@ class GuardedAdam:
 
         Where the loss has weights that change within a stage, what is judged is one without.
         """
-        judged = loss.detach() if judged is None else judged.detach()
+        self.begin(step, stage)
+        gradients: Sequence[Tensor | None] = torch.autograd.grad(
+            loss.sum(), self._parameters, allow_unused=True
+        )
+        for own, gradient in zip(self.gradients, gradients, strict=True):
+            if gradient is None:
+                own.zero_()
+            else:
+                own.copy_(gradient)
+        self.descend(step, loss.detach() if judged is None else judged.detach())
+
+    def begin(self, step: int, stage: int) -> None:
+        """Judge the stage before, if this is a new one; before gradients are taken."""
         if stage != self._stage:
             self.look(step)
             self._stage, self._begins = stage, True
             self._best.fill_(torch.inf)
+
+    def descend(self, step: int, judged: Tensor) -> None:
+        """Take a step down `gradients`, which are overwritten; what is judged is the loss, (m,)."""
+        gradient = self._gradient
         if self._begins:  # a stage begins: what it has to be better than
             self._first = judged.clone()
             self._best = torch.where(self._first.isfinite(), self._first, self._best)
             self._begins = bool(self._best.isinf().all())
-        gradients = torch.autograd.grad(loss.sum(), self._parameters, allow_unused=True)
-        gradient = self._joined(
-            [torch.zeros_like(p) if g is None else g
-             for g, p in zip(gradients, self._parameters, strict=True)]
-        )  # fmt: skip
         norm, self._last = gradient.norm(dim=1), judged
         if self.failures or not math.isfinite(norm.sum()):
             trains = norm.isfinite() & ~self.failed
@@ -191,10 +212,12 @@ class GuardedAdam:
         gradient.mul_((self._max_norm / norm.clamp_min(self._max_norm))[:, None])
         self._sum += self._last
         self._count += 1
-        before = self._flat.detach().clone() if self._slowed else None
-        self._adam(gradient)
+        before = self._flat.clone() if self._slowed else None
+        rate, decay = self._cycle[self._taken]
+        self._taken += 1
+        self._adam.step(gradient, rate, decay)
         if before is not None:
-            self._flat.data.copy_(torch.lerp(before, self._flat.detach(), self._rate[:, None]))
+            self._flat.copy_(torch.lerp(before, self._flat, self._rate[:, None]))
         if self._count == WINDOW:
             self.look(step)
 
@@ -216,7 +239,7 @@ class GuardedAdam:
         loss = self._sum / self._count
         allowed = self._best + TOLERANCE * self._best.abs().clamp_min(1.0)
         bad = ~loss.isfinite() | (loss > allowed) | (self._last > allowed)
-        bad |= ~self._flat.detach().isfinite().all(1)
+        bad |= ~self._flat.isfinite().all(1)
         bad &= ~self.failed
         self._best = torch.where(bad, self._best, torch.minimum(self._best, loss))
         self._kept = torch.where(bad, self._kept, loss)
@@ -249,25 +272,16 @@ class GuardedAdam:
             "or the weights."
         )
 
-    def _adam(self, gradient: Tensor) -> None:
-        rate, decay = self._cycle[self._taken]
-        self._taken += 1
-        adam_step(self._flat.data, gradient, self._moments, self._n_taken, rate, decay)
-
     def _state(self) -> list[Tensor]:
         """Return the parameters and Adam's moments."""
-        return [self._flat.data, *self._moments]
+        return [self._flat, self._adam.mean, self._adam.square]
 
-    def _joined(self, tensors: Sequence[Tensor]) -> Tensor:
-        """Join tensors of the parameters' shapes to (m, p)."""
-        rows = [t.movedim(axis, 0) for t, axis in zip(tensors, self._axes, strict=True)]
-        return torch.cat([t.reshape(len(t), -1) for t in rows], dim=1)
-
-    def _make_views(self) -> None:
-        """Make the parameters views of the joined ones."""
-        at = 0
+    def _views(self, flat: Tensor) -> list[Tensor]:
+        """Return the parts of an array (m, p) in the parameters' shapes."""
+        found, at = [], 0
         for parameter, axis in zip(self._parameters, self._axes, strict=True):
             shape = parameter.detach().movedim(axis, 0).shape
             size = parameter.numel() // shape[0]
-            parameter.data = self._flat.data[:, at : at + size].view(shape).movedim(0, axis)
+            found.append(flat[:, at : at + size].view(shape).movedim(0, axis))
             at += size
+        return found

@@ -14,6 +14,7 @@ h + 1). Biases are the weights of an input that is 1 and of a unit that is 1: it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,102 +26,195 @@ Array = Any
 """A NumPy array or a torch tensor."""
 
 
-class Weights(NamedTuple):
-    """What the chain is made of, and how it is cut."""
+class LayerWeights(NamedTuple):
+    """A layer's weights, and views of them on their sides."""
 
     rotation: Array
+    rotation_t: Array
     hidden: Array
+    hidden_t: Array
     out: Array
-    n_kept: int
-    bound: float
+    out_t: Array
 
 
-class Trace(NamedTuple):
-    """What a pass leaves for its gradient, by layer."""
+class Weights:
+    """What the chain is made of, and how it is cut.
 
-    states: Array
-    """(layers + 1, ..., d, n): before and after each layer."""
+    Parameters
+    ----------
+    rotation, hidden, out : arrays
+        R, W1 and W2.
+    n_kept : int
+        Size of u_a.
+    bound : float
+        b.
+    """
+
+    def __init__(
+        self, rotation: Array, hidden: Array, out: Array, n_kept: int, bound: float
+    ) -> None:
+        self.rotation, self.hidden, self.out = rotation, hidden, out
+        self.n_kept, self.bound = n_kept, bound
+        sides = [(w, w.swapaxes(-1, -2)) for w in (rotation, hidden, out)]
+        self.layers = [
+            LayerWeights(*w) for w in zip(*(x for pair in sides for x in pair), strict=True)
+        ]
+
+
+class Layer(NamedTuple):
+    """What a pass leaves of one layer; those that are parts of others are views of them."""
+
+    before: Array
+    """(..., d, n), and so are the next two."""
     turned: Array
-    """(layers, ..., d, n): between the transform and the coupling."""
+    """Between the transform and the coupling."""
+    after: Array
+    turned_kept: Array
+    turned_moved: Array
+    after_kept: Array
+    after_moved: Array
     seen: Array
-    """(layers, ..., seen + 1, n): the conditioner's input."""
+    """(..., seen + 1, n): the conditioner's input."""
+    seen_kept: Array
     units: Array
-    """(layers, ..., h + 1, n)."""
+    """(..., h + 1, n)."""
     squashed: Array
-    """(layers, ..., moved, n): tanh(s^ / b)."""
+    """(..., moved, n): tanh(s^ / b)."""
     scales: Array
-    """(layers, ..., moved, n): exp(s), or exp(-s) of the inverse."""
+    """(..., moved, n): exp(s), or exp(-s) of the inverse."""
 
 
-def forward(xp: Any, z: Array, context: Array | None, w: Weights) -> tuple[Array, Trace]:
+class Trace:
+    """What a pass leaves for its gradient, in arrays that lead with the layer."""
+
+    def __init__(self, xp: Any, like: Array, w: Weights) -> None:
+        n_layers, (d, _) = len(w.layers), like.shape[-2:]
+        lead, k = (n_layers, *like.shape[:-2]), w.n_kept
+        h, n_seen = w.hidden.shape[-2:]
+        self.states = _empty(xp, like, (n_layers + 1, *like.shape[:-2], d))
+        self.turned = _empty(xp, like, (*lead, d))
+        self.seen = _empty(xp, like, (*lead, n_seen))
+        self.seen[..., -1, :] = 1
+        self.units = _empty(xp, like, (*lead, h))
+        self.squashed, self.scales = (_empty(xp, like, (*lead, d - k)) for _ in range(2))
+        # The conditioner's output: what goes into tanh, and t.
+        out = _empty(xp, like, (*like.shape[:-2], 2 * (d - k)))
+        self.out, self.narrowed, self.shift = out, out[..., : d - k, :], out[..., d - k :, :]
+        before, after = self.states[:-1], self.states[1:]
+        parts = (
+            before, self.turned, after,
+            self.turned[..., :k, :], self.turned[..., k:, :],
+            after[..., :k, :], after[..., k:, :],
+            self.seen, self.seen[..., :k, :], self.units, self.squashed, self.scales,
+        )  # fmt: skip
+        self.layers = [Layer(*layer) for layer in zip(*parts, strict=True)]
+
+
+class Memory:
+    """Arrays that are used again, step by step: new ones cost the kernel's pages every time.
+
+    What a pass returns with a memory is overwritten by the next pass of its shapes with it.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[Any, Any] = {}
+
+    def take(self, key: tuple[str, Array], make: Callable[[], Any]) -> Any:
+        """Return what was made for a key's name and shape before, or make it."""
+        name, like = key
+        known = name, tuple(like.shape)
+        if known not in self._kept:
+            self._kept[known] = make()
+        return self._kept[known]
+
+
+def forward(
+    xp: Any, z: Array, context: Array | None, w: Weights, memory: Memory | None = None
+) -> tuple[Array, Trace]:
     """Return y = h(z), (..., d, n), and the trace."""
-    k, trace = w.n_kept, _empty_trace(xp, z, context, w)
-    out = _empty(xp, z, w.out.shape[1:-1])
+    trace = _begun("forward", xp, z, context, w, memory)
     trace.states[0] = z
-    for layer in range(len(w.rotation)):
-        u, y = trace.turned[layer], trace.states[layer + 1]
-        xp.matmul(w.rotation[layer], trace.states[layer], out=u)
-        shift, scale = _coefficients(xp, trace, w, layer, u, out, 1.0)
-        y[..., :k, :] = u[..., :k, :]
-        moved = y[..., k:, :]
-        xp.multiply(u[..., k:, :], scale, out=moved)
-        moved += shift
+    for layer, weights in zip(trace.layers, w.layers, strict=True):
+        _matmul(xp, weights.rotation, layer.before, layer.turned)
+        layer.seen_kept[...] = layer.turned_kept
+        _conditioned(xp, trace, layer, weights, w.bound)
+        layer.after_kept[...] = layer.turned_kept
+        xp.multiply(layer.turned_moved, layer.scales, out=layer.after_moved)
+        xp.add(layer.after_moved, trace.shift, out=layer.after_moved)
     return trace.states[-1], trace
 
 
 def forward_gradient(
-    xp: Any, g: Array, trace: Trace, w: Weights
+    xp: Any, g: Array, trace: Trace, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of z, of the context and of R, W1, W2, from that of y."""
-    k, work = w.n_kept, _Work(xp, g, trace, w)
-    for layer in reversed(range(len(w.rotation))):
-        u, g_b, g_u = trace.turned[layer], work.g[..., k:, :], work.g_u
-        g_moved = g_u[..., k:, :]
-        xp.multiply(g_b, trace.scales[layer], out=g_moved)
-        xp.multiply(g_moved, u[..., k:, :], out=work.g_s)
-        work.g_shift[...] = g_b
-        g_seen = work.conditioner(trace, w, layer)
-        xp.add(work.g[..., :k, :], g_seen[..., :k, :], out=g_u[..., :k, :])
-        xp.matmul(g_u, trace.states[layer].swapaxes(-1, -2), out=work.g_rotation[layer])
-        xp.matmul(w.rotation[layer].swapaxes(-1, -2), g_u, out=work.g)
-    return work.g, work.g_context, (work.g_rotation, work.g_hidden, work.g_out)
+    work = _working("forward gradient", xp, g, trace, w, memory)
+    work.states[-1] = g
+    for layer, own, weights in zip(
+        trace.layers[::-1], work.layers[::-1], w.layers[::-1], strict=True
+    ):
+        xp.multiply(own.after_moved, layer.scales, out=own.turned_moved)
+        xp.multiply(own.turned_moved, layer.turned_moved, out=own.log_scale)
+        own.shift[...] = own.after_moved
+        work.conditioner(own, weights)
+        xp.add(own.after_kept, work.seen_kept, out=own.turned_kept)
+        _matmul(xp, weights.rotation_t, own.turned, own.before)
+    return work.states[0], work.context, work.weights(work.turned, trace.states[:-1], trace)
 
 
-def inverse(xp: Any, y: Array, context: Array | None, w: Weights) -> tuple[Array, Array, Trace]:
+def inverse(
+    xp: Any, y: Array, context: Array | None, w: Weights, memory: Memory | None = None
+) -> tuple[Array, Array, Trace]:
     """Return z = h^-1(y), (..., d, n), log |det dz/dy|, (..., n), and the trace."""
-    k, trace = w.n_kept, _empty_trace(xp, y, context, w)
-    out = _empty(xp, y, w.out.shape[1:-1])
+    trace = _begun("inverse", xp, y, context, w, memory)
     trace.states[-1] = y
-    for layer in reversed(range(len(w.rotation))):
-        u, y = trace.turned[layer], trace.states[layer + 1]
-        shift, shrink = _coefficients(xp, trace, w, layer, y, out, -1.0)
-        u[..., :k, :] = y[..., :k, :]
-        moved = u[..., k:, :]
-        xp.subtract(y[..., k:, :], shift, out=moved)
-        moved *= shrink
-        xp.matmul(w.rotation[layer].swapaxes(-1, -2), u, out=trace.states[layer])
+    for layer, weights in zip(trace.layers[::-1], w.layers[::-1], strict=True):
+        layer.seen_kept[...] = layer.after_kept
+        _conditioned(xp, trace, layer, weights, -w.bound)
+        layer.turned_kept[...] = layer.after_kept
+        xp.subtract(layer.after_moved, trace.shift, out=layer.turned_moved)
+        xp.multiply(layer.turned_moved, layer.scales, out=layer.turned_moved)
+        _matmul(xp, weights.rotation_t, layer.turned, layer.before)
     return trace.states[0], -w.bound * trace.squashed.sum(0).sum(-2), trace
 
 
 def inverse_gradient(
-    xp: Any, g: Array, g_log_det: Array, trace: Trace, w: Weights
+    xp: Any, g: Array, g_log_det: Array, trace: Trace, w: Weights, memory: Memory | None = None
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Return the gradients of y, of the context and of R, W1, W2, from those of z and log |det|."""
-    k, work = w.n_kept, _Work(xp, g, trace, w)
-    for layer in range(len(w.rotation)):
-        u, g_u = trace.turned[layer], work.g_u
-        xp.matmul(u, work.g.swapaxes(-1, -2), out=work.g_rotation[layer])
-        xp.matmul(w.rotation[layer], work.g, out=g_u)
-        g_b = g_u[..., k:, :]
-        xp.multiply(g_b, u[..., k:, :], out=work.g_s)
-        work.g_s += g_log_det[..., None, :]
-        work.g_s *= -1.0
-        g_moved = work.g[..., k:, :]
-        xp.multiply(g_b, trace.scales[layer], out=g_moved)
-        xp.multiply(g_moved, -1.0, out=work.g_shift)
-        g_seen = work.conditioner(trace, w, layer)
-        xp.add(g_u[..., :k, :], g_seen[..., :k, :], out=work.g[..., :k, :])
-    return work.g, work.g_context, (work.g_rotation, work.g_hidden, work.g_out)
+    work = _working("inverse gradient", xp, g, trace, w, memory)
+    work.states[0] = g
+    log_det = g_log_det[..., None, :]
+    for layer, own, weights in zip(trace.layers, work.layers, w.layers, strict=True):
+        _matmul(xp, weights.rotation, own.before, own.turned)
+        xp.multiply(own.turned_moved, layer.turned_moved, out=own.log_scale)
+        xp.add(own.log_scale, log_det, out=own.log_scale)
+        xp.negative(own.log_scale, out=own.log_scale)
+        xp.multiply(own.turned_moved, layer.scales, out=own.after_moved)
+        xp.negative(own.after_moved, out=own.shift)
+        work.conditioner(own, weights)
+        xp.add(own.turned_kept, work.seen_kept, out=own.after_kept)
+    return work.states[-1], work.context, work.weights(trace.turned, work.states[:-1], trace)
+
+
+class LayerWork(NamedTuple):
+    """Gradients of what a `Layer` has, and slopes."""
+
+    before: Array
+    turned: Array
+    turned_kept: Array
+    turned_moved: Array
+    after_kept: Array
+    after_moved: Array
+    both: Array
+    """Of what the conditioner returns: the next two."""
+    log_scale: Array
+    shift: Array
+    units: Array
+    slope: Array
+    """1 - tanh^2 of the units."""
+    narrow: Array
+    """b (1 - tanh^2) of the log-scales."""
 
 
 class _Work:
@@ -128,52 +222,92 @@ class _Work:
 
     def __init__(self, xp: Any, g: Array, trace: Trace, w: Weights) -> None:
         self.xp = xp
-        h, seen = w.hidden.shape[-2:]
+        n_layers, n_seen, k = len(w.layers), w.hidden.shape[-1], w.n_kept
         lead, d = g.shape[:-2], g.shape[-2]
-        n_moved = d - w.n_kept
-        self.g = _empty(xp, g, (*lead, d))
-        self.g[...] = g
-        self.g_u = _empty(xp, g, (*lead, d))
-        self.g_both = _empty(xp, g, (*lead, 2 * n_moved))
-        self.g_s, self.g_shift = self.g_both[..., :n_moved, :], self.g_both[..., n_moved:, :]
-        self.g_units, self.g_seen = _empty(xp, g, (*lead, h)), _empty(xp, g, (*lead, seen))
-        self.g_context = _empty(xp, g, (*lead, seen - 1 - w.n_kept))
-        self.g_context[...] = 0
-        self.g_rotation, self.g_hidden, self.g_out = (
-            xp.empty_like(x) for x in (w.rotation, w.hidden, w.out)
-        )
-        # 1 - tanh^2 of the units and, with the bound, of the log-scales.
-        self.slopes = 1 - trace.units * trace.units
-        self.narrows = w.bound * (1 - trace.squashed * trace.squashed)
+        self.states = _empty(xp, g, (n_layers + 1, *lead, d))
+        self.turned = _empty(xp, g, (n_layers, *lead, d))
+        self.both = _empty(xp, g, (n_layers, *lead, 2 * (d - k)))
+        self.units, self.slopes = (xp.empty_like(trace.units) for _ in range(2))
+        self.narrows = xp.empty_like(trace.squashed)
+        self.seen = _empty(xp, g, (*lead, n_seen))
+        self.seen_kept, self.seen_context = self.seen[..., :k, :], self.seen[..., k:-1, :]
+        self.context = xp.zeros_like(self.seen_context)
+        self.g_weights = tuple(xp.empty_like(x) for x in (w.rotation, w.hidden, w.out))
+        before, after = self.states[:-1], self.states[1:]
+        parts = (
+            before, self.turned,
+            self.turned[..., :k, :], self.turned[..., k:, :],
+            after[..., :k, :], after[..., k:, :],
+            self.both, self.both[..., : d - k, :], self.both[..., d - k :, :],
+            self.units, self.slopes, self.narrows,
+        )  # fmt: skip
+        self.layers = [LayerWork(*layer) for layer in zip(*parts, strict=True)]
 
-    def conditioner(self, trace: Trace, w: Weights, layer: int) -> Array:
-        """Take the weights' gradients from those of s and t; return that of what was seen."""
+    def begin(self, trace: Trace, w: Weights) -> None:
+        """Take in what a pass left."""
+        self.context[...] = 0
+        for squares, slopes, factor in (
+            (trace.units, self.slopes, 1.0),
+            (trace.squashed, self.narrows, w.bound),
+        ):
+            self.xp.multiply(squares, squares, out=slopes)
+            slopes *= -factor
+            slopes += factor
+
+    def conditioner(self, own: LayerWork, weights: LayerWeights) -> None:
+        """Take the gradients of s and t on to what was seen."""
         xp = self.xp
-        self.g_s *= self.narrows[layer]
-        xp.matmul(self.g_both, trace.units[layer].swapaxes(-1, -2), out=self.g_out[layer])
-        xp.matmul(w.out[layer].swapaxes(-1, -2), self.g_both, out=self.g_units)
-        self.g_units *= self.slopes[layer]
-        xp.matmul(self.g_units, trace.seen[layer].swapaxes(-1, -2), out=self.g_hidden[layer])
-        xp.matmul(w.hidden[layer].swapaxes(-1, -2), self.g_units, out=self.g_seen)
-        if self.g_context.shape[-2]:
-            self.g_context += self.g_seen[..., w.n_kept : -1, :]
-        return self.g_seen
+        xp.multiply(own.log_scale, own.narrow, out=own.log_scale)
+        _matmul(xp, weights.out_t, own.both, own.units)
+        xp.multiply(own.units, own.slope, out=own.units)
+        _matmul(xp, weights.hidden_t, own.units, self.seen)
+        if self.context.shape[-2]:
+            self.context += self.seen_context
+
+    def weights(self, turned: Array, still: Array, trace: Trace) -> tuple[Array, Array, Array]:
+        """Return the gradients of R, from what is (..., d, n) behind it and before, W1 and W2."""
+        g_rotation, g_hidden, g_out = self.g_weights
+        self.xp.matmul(turned, still.swapaxes(-1, -2), out=g_rotation)
+        self.xp.matmul(self.units, trace.seen.swapaxes(-1, -2), out=g_hidden)
+        self.xp.matmul(self.both, trace.units.swapaxes(-1, -2), out=g_out)
+        return g_rotation, g_hidden, g_out
 
 
-def _coefficients(
-    xp: Any, trace: Trace, w: Weights, layer: int, state: Array, out: Array, sign: float
-) -> tuple[Array, Array]:
-    """Fill in the trace of a layer's conditioner; return t and exp(sign s)."""
-    k, units, scale = w.n_kept, trace.units[layer], trace.scales[layer]
-    trace.seen[layer][..., :k, :] = state[..., :k, :]
-    xp.matmul(w.hidden[layer], trace.seen[layer], out=units)
-    _tanh(xp, units, units)
-    xp.matmul(w.out[layer], units, out=out)
-    n_moved = scale.shape[-2]
-    _tanh(xp, out[..., :n_moved, :], trace.squashed[layer])
-    xp.multiply(trace.squashed[layer], sign * w.bound, out=scale)
-    xp.exp(scale, out=scale)
-    return out[..., n_moved:, :], scale
+def _working(
+    name: str, xp: Any, g: Array, trace: Trace, w: Weights, memory: Memory | None
+) -> _Work:
+    memory = Memory() if memory is None else memory
+    work: _Work = memory.take((name, g), lambda: _Work(xp, g, trace, w))
+    work.begin(trace, w)
+    return work
+
+
+def _begun(
+    name: str, xp: Any, state: Array, context: Array | None, w: Weights, memory: Memory | None
+) -> Trace:
+    """Return a pass's trace, with nothing but its context in it."""
+    memory = Memory() if memory is None else memory
+    trace: Trace = memory.take((name, state), lambda: Trace(xp, state, w))
+    if context is not None:
+        trace.seen[..., w.n_kept : -1, :] = context
+    return trace
+
+
+def _conditioned(xp: Any, trace: Trace, layer: Layer, weights: LayerWeights, bound: float) -> None:
+    """Fill in what a layer's conditioner makes of what it sees: exp(+-s) and t."""
+    _matmul(xp, weights.hidden, layer.seen, layer.units)
+    _tanh(xp, layer.units, layer.units)
+    _matmul(xp, weights.out, layer.units, trace.out)
+    _tanh(xp, trace.narrowed, layer.squashed)
+    xp.multiply(layer.squashed, bound, out=layer.scales)
+    xp.exp(layer.scales, out=layer.scales)
+
+
+def _matmul(xp: Any, left: Array, right: Array, out: Array) -> None:
+    if xp is np and right.ndim == 2:  # the same product, with less before it
+        np.dot(left, right, out=out)
+    else:
+        xp.matmul(left, right, out=out)
 
 
 def _tanh(xp: Any, x: Array, out: Array) -> None:
@@ -191,21 +325,3 @@ def _empty(xp: Any, like: Array, lead: tuple[int, ...]) -> Array:
     if xp is np:
         return np.empty(shape, dtype=like.dtype)
     return xp.empty(shape, dtype=like.dtype, device=like.device)
-
-
-def _empty_trace(xp: Any, z: Array, context: Array | None, w: Weights) -> Trace:
-    n_layers, (d, _) = len(w.rotation), z.shape[-2:]
-    lead, (h, n_seen) = (n_layers, *z.shape[:-2]), w.hidden.shape[-2:]
-    n_moved = d - w.n_kept
-    seen = _empty(xp, z, (*lead, n_seen))
-    seen[..., -1, :] = 1
-    if context is not None:
-        seen[..., w.n_kept : -1, :] = context
-    return Trace(
-        _empty(xp, z, (n_layers + 1, *z.shape[:-2], d)),
-        _empty(xp, z, (*lead, d)),
-        seen,
-        _empty(xp, z, (*lead, h)),
-        _empty(xp, z, (*lead, n_moved)),
-        _empty(xp, z, (*lead, n_moved)),
-    )

@@ -64,7 +64,7 @@ def _numbers(xp: Any, x: Array) -> list[Number]:
     return [x[:, i, j, None] for i in range(x.shape[1]) for j in range(x.shape[2])]
 
 
-def _matrix(xp: Any, like: Array, rows: int, numbers: Sequence[Number]) -> Array:
+def matrix(xp: Any, like: Array, rows: int, numbers: Sequence[Number]) -> Array:
     """Return numbers as (m, rows, columns), in the precision of an array."""
     if isinstance(numbers[0], float):
         return np.array(numbers, dtype=like.dtype).reshape(1, rows, -1)
@@ -185,7 +185,7 @@ def applied(xp: Any, e: Exponential, z: Array) -> Applied:
     """Return exp(A t) z."""
     even, odd = (_as(z, x)[:, None, :, None] for x in (e.even, e.odd))
     _, b, c, _ = e.drift
-    centred = _matrix(xp, z, 2, [e.half, b, c, -e.half])
+    centred = matrix(xp, z, 2, [e.half, b, c, -e.half])
     turned = (centred @ z.reshape(*z.shape[:2], -1)).reshape(z.shape)
     return Applied(even * z + odd * turned, z, turned, even, odd, centred)
 
@@ -221,7 +221,7 @@ class Propagate(torch.autograd.Function):
         xp, e, x, drift = ctx.kept
         _, (g_,) = arrays_of(g)
         g_z, parts = applied_gradient(xp, x, g_)
-        g_drift = _matrix(xp, drift, 2, exponential_gradient(xp, e, *parts))
+        g_drift = matrix(xp, drift, 2, exponential_gradient(xp, e, *parts))
         return (*tensors_of(g_drift, g_z), None)
 
 
@@ -255,7 +255,7 @@ def covariance(xp: Any, e: Exponential, noise: Array) -> Covariance:
     p11 = (det * n2 + c * c * n1 + a * a * n2) / scale
     m00, m01 = h * p00 + b * p01, h * p01 + b * p11
     m10, m11 = c * p00 - h * p01, c * p01 - h * p11
-    parts = _matrix(xp, e.even, 3, [
+    parts = matrix(xp, e.even, 3, [
         p00, -2 * m00, -(m00 * h + m01 * b),
         p01, -(m01 + m10), -(m00 * c - m01 * h),
         p11, -2 * m11, -(m10 * c - m11 * h),
@@ -312,72 +312,99 @@ def covariance_gradient(
     return g_drift, g_noise, (g_even, g_odd, (g_h, g_b, g_c))
 
 
-class TransitionLogProb(torch.autograd.Function):
-    """log N(z1 | F z0, P - F P F^T), (m, q, p), as one node.
+class Transition(NamedTuple):
+    """log p(z1 | z0), and what its gradient needs."""
 
-    Takes A and a diagonal K K^T (m, 2, 2), z0, z1 (m, 2, q, p) and times (m, q). The covariance is
-    computed in float64: it is a small difference of large numbers.
+    log_prob: Array
+    """(m, q, p), in the precision of the states."""
+    exponential: Exponential
+    covariance: Covariance
+    applied: Applied
+    whiten: Array
+    """(m, 3, q): what the Cholesky factor's inverse is made of."""
+    residual: Array
+    """(m, 2, q, p): the inverse covariance times z1 - F z0."""
+
+
+def transition(
+    xp: Any, drift: Array, noise: Array, before: Array, after: Array, times: Array
+) -> Transition:
+    """Return log N(z1 | F z0, P - F P F^T) for z0, z1 (m, 2, q, p) and times (m, q).
+
+    Takes A and a diagonal K K^T (m, 2, 2), and both and the times in float64: the covariance is a
+    small difference of large numbers.
     """
+    e = exponential(xp, drift, times)
+    s = covariance(xp, e, noise)
+    x = applied(xp, e, before)
+    # The Cholesky factor's inverse W: the squares cannot become negative by rounding.
+    slope = s.entries[:, 1] / s.entries[:, 0]
+    rest = s.entries[:, 2] - s.entries[:, 1] * slope
+    whiten = xp.stack([1 / xp.sqrt(s.entries[:, 0]), slope, 1 / xp.sqrt(rest)], 1)
+    shift = xp.log(s.entries[:, 0] * rest) / 2 + math.log(2 * math.pi)
+    own, along, other = (_as(before, whiten)[:, i, :, None] for i in range(3))
+    u = after - x.reached
+    first = u[:, 0] * own
+    second = (u[:, 1] - along * u[:, 0]) * other
+    u[:, 1] = other * second
+    u[:, 0] = own * first - along * u[:, 1]
+    log_prob = (first * first + second * second) * -0.5 - _as(before, shift)[:, :, None]
+    return Transition(log_prob, e, s, x, whiten, u)
+
+
+def transition_gradient(
+    xp: Any, made: Transition, g: Array
+) -> tuple[list[Number], list[Number], Array, Array]:
+    """Return the gradients of a, b, c, d, of K K^T's diagonal, of z0 and of z1."""
+    _, e, s, x, whiten, u = made
+    g_mean = g[:, None] * u
+    g_z0, by_mean = applied_gradient(xp, x, g_mean)
+    # By the entries: (u u^T - inverse) / 2, summed over the points; (0, 1) stands for two.
+    own, along, other = (whiten[:, i] for i in range(3))
+    precision = other * other
+    inverse = xp.stack(
+        [own * own + precision * along * along, -2 * precision * along, precision], 1
+    )
+    crosses = xp.stack([(g_mean[:, i] * u[:, j]).sum(-1) for i, j in ((0, 0), (0, 1), (1, 1))], 1)
+    g_entries = _as(e.even, crosses) / 2
+    g_entries[:, 1] *= 2
+    g_entries -= _as(e.even, g.sum(-1))[:, None] * inverse / 2
+    through, g_noise, (g_even, g_odd, g_centred) = covariance_gradient(xp, e, s, g_entries)
+    mean_even, mean_odd, mean_centred = by_mean
+    parts = exponential_gradient(
+        xp,
+        e,
+        g_even + _as(e.even, mean_even),
+        g_odd + _as(e.even, mean_odd),
+        [p + q for p, q in zip(g_centred, mean_centred, strict=True)],
+    )
+    return [p + q for p, q in zip(parts, through, strict=True)], g_noise, g_z0, -g_mean
+
+
+class TransitionLogProb(torch.autograd.Function):
+    """`transition` for A, K K^T (m, 2, 2), z0, z1 (m, 2, q, p) and times (m, q), as one node."""
 
     @staticmethod
     def forward(
         ctx: Any, drift: Tensor, noise: Tensor, z0: Tensor, z1: Tensor, times: Tensor
     ) -> Tensor:
-        """Return the log density."""
+        """Return the log density, (m, q, p)."""
         precise = (drift.double(), noise.double(), times.double())
         xp, (drift_, noise_, times_, before, after) = arrays_of(*precise, z0, z1)
-        e = exponential(xp, drift_, times_)
-        s = covariance(xp, e, noise_)
-        x = applied(xp, e, before)
-        # The Cholesky factor's inverse W: the squares cannot become negative by rounding.
-        slope = s.entries[:, 1] / s.entries[:, 0]
-        rest = s.entries[:, 2] - s.entries[:, 1] * slope
-        whiten = xp.stack([1 / xp.sqrt(s.entries[:, 0]), slope, 1 / xp.sqrt(rest)], 1)
-        shift = xp.log(s.entries[:, 0] * rest) / 2 + math.log(2 * math.pi)
-        own, along, other = (_as(before, whiten)[:, i, :, None] for i in range(3))
-        u = after - x.reached
-        first = u[:, 0] * own
-        second = (u[:, 1] - along * u[:, 0]) * other
-        u[:, 1] = other * second
-        u[:, 0] = own * first - along * u[:, 1]  # now the inverse covariance times the residual
-        ctx.kept = xp, e, s, x, whiten, u
+        ctx.kept = xp, transition(xp, drift_, noise_, before, after, times_)
         ctx.like = drift.detach()[:0], noise.detach()[:0]
-        shift = _as(before, shift)[:, :, None]
-        return tensors_of((first * first + second * second) * -0.5 - shift)[0]
+        return tensors_of(ctx.kept[1].log_prob)[0]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradients of A, K K^T, z0 and z1."""
-        xp, e, s, x, whiten, u = ctx.kept
+        xp, made = ctx.kept
         _, (g_, drift, noise) = arrays_of(g, *ctx.like)
-        g_mean = g_[:, None] * u
-        g_z0, by_mean = applied_gradient(xp, x, g_mean)
-        # By the entries: (u u^T - inverse) / 2, summed over the points; (0, 1) stands for two.
-        own, along, other = (whiten[:, i] for i in range(3))
-        precision = other * other
-        inverse = xp.stack(
-            [own * own + precision * along * along, -2 * precision * along, precision], 1
-        )
-        crosses = xp.stack(
-            [(g_mean[:, i] * u[:, j]).sum(-1) for i, j in ((0, 0), (0, 1), (1, 1))], 1
-        )
-        g_entries = _as(e.even, crosses) / 2
-        g_entries[:, 1] *= 2
-        g_entries -= _as(e.even, g_.sum(-1))[:, None] * inverse / 2
-        through, g_noise, (g_even, g_odd, g_centred) = covariance_gradient(xp, e, s, g_entries)
-        mean_even, mean_odd, mean_centred = by_mean
-        parts = exponential_gradient(
-            xp,
-            e,
-            g_even + _as(e.even, mean_even),
-            g_odd + _as(e.even, mean_odd),
-            [p + q for p, q in zip(g_centred, mean_centred, strict=True)],
-        )
-        g_drift = _matrix(xp, drift, 2, [p + q for p, q in zip(parts, through, strict=True)])
-        none = 0 * g_noise[0]
-        g_noise_ = _matrix(xp, noise, 2, [g_noise[0], none, none, g_noise[1]])
-        return (*tensors_of(g_drift, g_noise_, g_z0, -g_mean), None)
+        g_drift, (first, last), g_z0, g_z1 = transition_gradient(xp, made, g_)
+        none = 0 * first
+        g_noise = matrix(xp, noise, 2, [first, none, none, last])
+        return (*tensors_of(matrix(xp, drift, 2, g_drift), g_noise, g_z0, g_z1), None)
 
 
 def _as(like: Array, x: Array) -> Array:

@@ -39,14 +39,15 @@ from torch import Tensor, nn
 
 from iflow_gym.baselines.imitation_flow.calm import Calm, Calmness, Sampling
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig, Resolved
+from iflow_gym.baselines.imitation_flow.coupling import CouplingFlow
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.guard import (
+    Adam,
     GuardedAdam,
     Restart,
     TrainingError,
-    adam_step,
 )
 from iflow_gym.baselines.imitation_flow.inward import N_STATES, Inward
 from iflow_gym.baselines.imitation_flow.latent import INITIAL_DECAY, Latent, LinearLatent
@@ -62,9 +63,19 @@ from iflow_gym.baselines.imitation_flow.objectives import (
     tube,
 )
 from iflow_gym.baselines.imitation_flow.passes import Term, encode, evaluate
+from iflow_gym.baselines.imitation_flow.whole_step import (
+    Preparation,
+    Weights,
+    WholeStep,
+    by_hand,
+)
 
 SQUARED_ERROR_WEIGHT = 300.0
 """Weight of the squared error, against which the penalties are measured."""
+
+GROUP = 8
+"""So many models train as one batch where the step is by hand: of more, what they work on does not
+stay in a processor's cache."""
 
 N_HORIZONS = 14
 """Sampling times in a step's likelihood."""
@@ -161,19 +172,29 @@ def _one_thread() -> Iterator[None]:
 def _train(
     config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
 ) -> list[Trained | TrainingError]:
-    # What overflows is noticed by its loss.
-    with _one_thread(), np.errstate(all="ignore"):
-        return _train_batch(config, tasks, rngs)
-
-
-def _train_batch(
-    config: ImitationFlowConfig, tasks: Sequence[Task], rngs: Sequence[np.random.Generator]
-) -> list[Trained | TrainingError]:
     device = torch.device(
         ("cuda" if torch.cuda.is_available() else "cpu")
         if config.device == "auto"
         else config.device
     )
+    n_groups = 1
+    if by_hand(config, tasks[0], device):
+        n_groups = math.ceil(len(tasks) / GROUP)
+    found: list[Trained | TrainingError] = []
+    # What overflows is noticed by its loss.
+    with _one_thread(), np.errstate(all="ignore"):
+        for group in np.array_split(np.arange(len(tasks)), n_groups):
+            mine = [tasks[i] for i in group], [rngs[i] for i in group]
+            found += _train_batch(config, *mine, device)
+    return found
+
+
+def _train_batch(
+    config: ImitationFlowConfig,
+    tasks: Sequence[Task],
+    rngs: Sequence[np.random.Generator],
+    device: torch.device,
+) -> list[Trained | TrainingError]:
     generators = [torch.Generator().manual_seed(int(rng.integers(2**63))) for rng in rngs]
     batch = _Batch(config, tasks, rngs, generators, device)
     n_steps, calm = batch.resolved.n_steps, batch.watched
@@ -232,6 +253,14 @@ class _Batch:
         self._orbit: MeanOrbit | None = None
         if data.cyclic and resolved.orbit_weight > 0:
             self._orbit = MeanOrbit(tasks, data, config.orbit_resolution)
+        self._whole: WholeStep | None = None
+        if by_hand(config, tasks[0], device):
+            assert isinstance(self.flow, CouplingFlow)
+            assert isinstance(self.latent, LinearLatent)
+            assert self._calm is not None
+            looked_at = N_HORIZONS, _n_pairs(config), self._calm.n_new
+            prepared = Preparation(config, data, rngs, *looked_at)
+            self._whole = WholeStep(self.flow, self.latent, data, self._calm, prepared, config)
         self._inward: Inward | None = None
         if data.cyclic and resolved.inward_weight > 0:
             self._inward = Inward(data)
@@ -261,8 +290,13 @@ class _Batch:
 
     def step(self, adam: GuardedAdam, step: int, stage: int) -> None:
         """Take one step of a stage."""
+        weights = _weights(self._config, self.resolved, step, stage)
+        if self._whole is not None:
+            adam.begin(step, stage)
+            adam.descend(step, self._whole(weights, adam.gradients))
+            return
         self._draws.new_step()
-        terms = _terms(self._config, step, stage, self.latent, self.data, self._draws)
+        terms = _terms(self._config, weights, self.latent, self.data, self._draws)
         calm, calm_weight = self._calm, self.resolved.calm_weight
         if calm is not None:
             terms.append((calm_weight, calm(self._draws)))
@@ -335,41 +369,54 @@ def _make_latent(config: ImitationFlowConfig, tasks: Sequence[Task]) -> Latent:
 # What a step minimises --------------------------------------------------------------------
 
 
+def _weights(config: ImitationFlowConfig, resolved: Resolved, step: int, stage: int) -> Weights:
+    """Return the weights of a step's terms."""
+    if stage != WHOLE:
+        return Weights(1.0, 0.0, 0.0, resolved.calm_weight)
+    turn = step % TURNS
+    return Weights(
+        TURNS * config.likelihood_weight * (turn == 0),
+        SQUARED_ERROR_WEIGHT,
+        TURNS * SQUARED_ERROR_WEIGHT * config.tube_weight * (turn == TURNS // 2),
+        resolved.calm_weight,
+    )
+
+
 def _terms(
     config: ImitationFlowConfig,
-    step: int,
-    stage: int,
+    weights: Weights,
     latent: Latent,
     data: Recordings,
     draws: Draws,
 ) -> list[tuple[float, Term]]:
     """Return the weighted terms of a step, but for the calm and the orbit."""
-    q, p = N_HORIZONS, max(1, config.n_pairs // N_HORIZONS)
+    q, p = N_HORIZONS, _n_pairs(config)
     if config.objective == "paper":
         return [(1.0, backward_likelihood(latent, data, draws, q, p))]
     terms: list[tuple[float, Term]] = []
-    whole = stage == WHOLE
-    turn = step % TURNS
-    weight = TURNS * config.likelihood_weight * (turn == 0) if whole else 1.0
-    if weight:
-        terms.append((weight, forward_likelihood(latent, data, draws, q, p)))
+    if weights.likelihood:
+        terms.append((weights.likelihood, forward_likelihood(latent, data, draws, q, p)))
     if data.cyclic:
         terms.append((1.0, stationary(latent, data, draws, q * p)))
-    if whole:
-        n, weight = config.n_times, SQUARED_ERROR_WEIGHT
+    if weights.reproduction:
         error = reproduction(
             data,
             draws,
-            n,
+            config.n_times,
             power=config.error_power,
             timing_weight=config.timing_weight,
             end_weight=config.end_weight,
         )
-        terms.append((weight, error))
-        if config.tube_weight and turn == TURNS // 2:
-            beside = tube(data, draws, max(n // 2, 1), width=config.tube_width)
-            terms.append((TURNS * weight * config.tube_weight, beside))
+        terms.append((weights.reproduction, error))
+    if weights.tube:
+        beside = tube(data, draws, max(config.n_times // 2, 1), width=config.tube_width)
+        terms.append((weights.tube, beside))
     return terms
+
+
+def _n_pairs(config: ImitationFlowConfig) -> int:
+    """Return the pairs of a horizon in a step's likelihood."""
+    return max(1, config.n_pairs // N_HORIZONS)
 
 
 def _stage(config: ImitationFlowConfig, step: int, data: Recordings) -> int:
@@ -390,7 +437,7 @@ def _resolved(config: ImitationFlowConfig, data: Recordings) -> Resolved:
 def _numbers_a_step(config: ImitationFlowConfig, data: Recordings) -> int:
     """Return how many random numbers a step draws at most."""
     n, d = data.n_recordings, data.n_dims
-    pairs = N_HORIZONS * max(1, config.n_pairs // N_HORIZONS)
+    pairs = N_HORIZONS * _n_pairs(config)
     return (
         2 * N_HORIZONS
         + 3 * pairs
@@ -412,11 +459,9 @@ def _fit_noise(
     with torch.no_grad():
         z = encode(flow, data, points).z.unflatten(-1, (2, NOISE_HORIZONS, NOISE_PAIRS))
     before, after = z.unbind(2)
-    # In memory of its own: a fused step takes arrays for contiguous, and this is a view of many.
     noise = latent.log_noise
-    noise.data = noise.data.clone()
-    moments, n_taken = [torch.zeros_like(noise) for _ in range(2)], noise.new_zeros(())
+    adam = Adam(noise.data)
     for _ in range(NOISE_STEPS):
         loss = -latent.transition_log_prob(before, after, times).mean((1, 2))
         (gradient,) = torch.autograd.grad(loss.sum(), noise)
-        adam_step(noise.data, gradient, moments, n_taken, NOISE_RATE, NOISE_DECAY)
+        adam.step(gradient, NOISE_RATE, NOISE_DECAY)

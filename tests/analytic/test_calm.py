@@ -96,7 +96,7 @@ def test_sweeps_have_lattices_of_their_own_and_their_fastest_states_are_looked_a
     low, high = data.centre - 2 * data.half, data.centre + 2 * data.half
     assert ((first >= low - 1e-6) & (first <= high + 1e-6)).all()
     speeds = torch.stack([watched.sweep(flow, latent) for _ in range(5)])
-    kept = watched._kept
+    kept = watched.kept
     with torch.no_grad():
         (excess,) = evaluate(flow, latent, data, [watched._excess(kept)])
     assert 1.5 * torch.exp(excess.amax()) == pytest.approx(float(speeds.max()), rel=1e-3)
