@@ -35,7 +35,11 @@ SCATTER = 5e-4
 """Samples that scatter by more than this fraction of the diagonal are smoothed by themselves."""
 
 SHARE = 0.07
-"""Window of that smoothing, as a fraction of the recording's duration."""
+"""Window of that smoothing, as a fraction of the recording's duration, at most."""
+
+MOVES = 1.5
+"""It is narrowed until it moves samples by no more than so many times their scatter: what it moves
+beyond that is the motion. A recording of many rounds is cut off at its corners otherwise."""
 
 ORDER = 3
 """Of the polynomials of Savitzky and Golay."""
@@ -294,8 +298,9 @@ def smoothed(
     recording : RawRecording
         Evenly sampled.
     window : float, optional
-        Seconds; 0 smooths nothing. By default `SHARE` of the duration, and nothing for samples that
-        scatter by less than `SCATTER` of the diagonal.
+        Seconds; 0 smooths nothing. By default `SHARE` of the duration, less where that would move
+        samples by more than `MOVES` times their scatter, and nothing for samples that scatter by
+        less than `SCATTER` of the diagonal.
     roughness : float, optional
         What `scatter` says of the recording before it was resampled; by default of this one.
 
@@ -314,6 +319,12 @@ def smoothed(
             return recording, None
         samples = _odd(max(SHARE * n, 7))
         samples = samples if samples <= n else _odd(n - 1, down=True)
+        while samples > ORDER + 2:
+            straight = savgol_filter(recording.positions, samples, ORDER, axis=0)
+            off = np.linalg.norm(straight - recording.positions, axis=1)
+            if np.sqrt(np.mean(off**2)) <= MOVES * rough:
+                break
+            samples = _odd(0.8 * samples, down=True)
     elif not (np.isfinite(window) and window >= 0):
         raise RecordingError(f"Expected a smoothing window >= 0 in seconds, got {window}.")
     elif window == 0:

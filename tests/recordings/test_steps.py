@@ -194,6 +194,22 @@ def test_scatter_is_the_noise_and_not_the_motion():
     assert scatter(noisy(clean, 0.003)) == pytest.approx(0.003 * np.sqrt(2), rel=0.1)
 
 
+def test_many_rounds_are_smoothed_and_keep_their_shape():
+    """7 % of eight rounds is half a round: as a window it would leave a dot."""
+    times = np.arange(1500) * 0.01
+    angle = 2 * np.pi * times / 1.9
+    clean = RawRecording("stir", times, np.stack([np.cos(angle), 0.6 * np.sin(2 * angle)], axis=1))
+    rough = noisy(clean, 0.005)
+    smooth, note = smoothed(rough)
+    assert note is not None
+    assert note.values["moved_rms"] <= 1.5 * note.values["scatter"]
+
+    def most(recording):
+        return np.linalg.norm(recording.positions - clean.positions, axis=1).max()
+
+    assert most(smooth) < most(rough)
+
+
 def test_what_scatters_is_smoothed_by_itself_and_comes_closer_to_the_truth():
     times = np.arange(300) * 0.01
     clean = line(times, duration=3.0)
