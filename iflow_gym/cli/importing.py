@@ -78,6 +78,12 @@ class Import:
             raise UsageError("Expected one thing for standard output, got several.")
         if self.sources.count(PIPE) > 1:
             raise UsageError("Expected standard input (-) once among the sources, got it again.")
+        again = [s for i, s in enumerate(self.sources) if s in self.sources[:i] and s != PIPE]
+        if again:
+            raise UsageError(
+                f"Expected each file of recordings once, got {again[0]} again: every demonstration "
+                "counts as one."
+            )
         check_output(self.output, *self.sources)
         if self.plot is not None:
             check_picture(self.plot)

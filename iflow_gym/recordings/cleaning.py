@@ -124,6 +124,11 @@ def clean(
         text = f"scaled by {factor:g}, from {came_in} to {unit}"
         notes.append(Note("units", "", text, {"factor": factor}))
     done = [_cleaned(r, chosen, notes) for r in before]
+    if chosen.hold_out and not 0 <= chosen.hold_out < len(done):
+        raise RecordingError(
+            f"Expected to hold out from 0 to {len(done) - 1} recordings, one less than there are, "
+            f"got {chosen.hold_out} (--hold-out)."
+        )
     if len({r.n_dims for r in done}) > 1:
         dims = sorted({r.n_dims for r in done})
         raise RecordingError(

@@ -18,6 +18,9 @@ from iflow_gym.demonstrations import FloatArray
 from iflow_gym.recordings.raw import RawRecording, RecordingError
 from iflow_gym.recordings.steps import Note, scaled
 
+SLOW = 1.0
+"""Seconds between samples from which a unit that nothing says is doubted."""
+
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 """Seconds in units of time."""
 
@@ -160,7 +163,8 @@ def from_table(table: Mapping[str, Column], columns: Columns, name: str) -> Read
             f"{', '.join(speeds)}."
         )
     said = plain[time][1] if time is not None else None
-    unit = columns.time_unit or (said if said in SECONDS and said is not None else "s")
+    told = columns.time_unit or (said if said in SECONDS else None)
+    unit = told or "s"
     stamps = None if time is None else _numbers(table, (time,), name)[:, 0]
     recordings = []
     for label, rows in _groups(table, group, name):
@@ -173,6 +177,7 @@ def from_table(table: Mapping[str, Column], columns: Columns, name: str) -> Read
         )
     left_out = [n for n in names if n not in {time, group, *positions, *speeds}]
     text = _said(time, unit, columns.dt, positions, speeds, group, left_out)
+    text += _doubt(told, recordings) if stamps is not None else ""
     if dropped_speeds:
         text += f" ({', '.join(dropped_speeds)}: no velocity for each coordinate)"
     values = {
@@ -337,6 +342,7 @@ def _stack(
         group_key,
         [],
     )
+    text += _doubt(columns.time_unit, recordings) if stamps is not None else ""
     if turn:
         text += "; turned, because it has more columns than rows"
     values = {
@@ -424,6 +430,17 @@ def _known(column: str, names: Sequence[str], where: str) -> str:
             f"Expected a column {column!r} in {where}, got {', '.join(names[:20])}.{hint}"
         )
     return column
+
+
+def _doubt(unit: str | None, recordings: Sequence[RawRecording]) -> str:
+    """Return a word on times that are taken for seconds and hardly are."""
+    apart = [float(np.median(np.abs(np.diff(r.times)))) for r in recordings if len(r) > 1]
+    if unit is not None or not apart or min(apart) < SLOW:
+        return ""
+    return (
+        f"; its samples are {min(apart):.3g} s apart then: if they are milliseconds, say so "
+        "(--time-unit ms)"
+    )
 
 
 def _numbers(table: Mapping[str, Column], names: Sequence[str], where: str) -> FloatArray:

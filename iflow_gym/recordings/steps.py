@@ -87,10 +87,10 @@ def in_order(
     )
     if bad_times == "error":
         raise RecordingError(
-            f"Expected increasing times in {recording.name}, got {counts} time stamps of "
-            f"{len(recording)}, the first at sample {at}: {recording.times[at]:g} s after "
+            f"Expected increasing times in {recording.name}, got {counts} among {len(recording)} "
+            f"time stamps, the first at sample {at}: {recording.times[at]:g} s after "
             f"{before[at]:g} s. Look whether two recordings are in one column (name the column "
-            "that tells them apart), or drop these samples (bad_times='drop', --bad-times drop)."
+            "that tells them apart), or drop these samples (--bad-times drop)."
         )
     note = Note(
         "times",

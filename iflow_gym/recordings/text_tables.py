@@ -44,7 +44,8 @@ def read(source: Source, columns: Columns) -> Reading:
     rows, lines = _rows(text, columns.delimiter, source.name)
     if len(rows) < 2:
         raise RecordingError(
-            f"Expected a table of samples in {source.name}, got {len(rows)} lines of it."
+            f"Expected a table of samples in {source.name}, a line for each, got "
+            f"{'one line' if rows else 'no line'}."
         )
     headed = any(_number(cell) is None for cell in rows[0])
     width = len(rows[0])

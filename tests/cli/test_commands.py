@@ -131,6 +131,7 @@ def test_completion_knows_the_commands(call):
         (["export", "linear.safetensors", "-o", "a.onnx"], "imitation-flow"),
         (["score", "-", "-"], "one of the inputs"),
         (["import", "reach.csv", "-o", "reach.csv"], "which is one of them"),
+        (["import", "reach.csv", "reach.csv", "-o", "a"], "reach.csv again"),
         (["import", "reach.csv", "-o", "a", "--plot", "a.gif"], ".png"),
         (["import", "reach.csv", "-o", "a", "--format", "xyz"], "csv, npz"),
         (["fit", "angle.safetensors", "-o", "angle.safetensors"], "which is one of them"),

@@ -132,7 +132,7 @@ def test_everything_that_is_done_is_noted():
         ({"period": 1.0, "kind": "goal"}, "drop one"),
         ({"kind": "cycle", "align": "shift"}, "to have no goal"),
         ({"still": 2.0}, "still from 0 to below 1"),
-        ({"hold_out": 7}, "held_out"),
+        ({"hold_out": 7}, "--hold-out"),
         ({"goal": (9.0, 9.0)}, "--align shift"),
         ({"period": -1.0}, "period > 0"),
     ],

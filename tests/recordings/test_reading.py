@@ -187,7 +187,7 @@ ERRORS = {
     "no heading": ("csv", b"\n".join(text(TABLE).split(b"\n")[1:]), None, "--positions 1 2"),
     "no times": ("csv", text({"x": T, "y": T}), None, "--dt"),
     "twice the same heading": ("csv", b"t,x,x\n1,2,3\n2,3,4", None, "more than once"),
-    "nothing": ("csv", b"", None, "got 0 lines"),
+    "nothing": ("csv", b"", None, "got no line"),
     "no text": ("csv", b"\xff\xfe\x00", None, "UTF-8"),
     "objects": ("npz", npz(x=np.array([{}])), None, "numbers and words"),
     "no positions": ("npz", npz(a=np.zeros(())), None, "--positions"),
@@ -280,3 +280,12 @@ def test_a_damaged_file_gives_recordings_or_the_clear_error(name, data):
     with contextlib.suppress(RecordingError):  # anything else is a failure
         recordings = read(bytes(content), kind).recordings
         assert all(r.positions.dtype == np.float64 for r in recordings)
+
+
+@pytest.mark.parametrize(
+    ("name", "apart", "doubted"), [("t", 10.0, True), ("t", 0.1, False), ("t_ms", 10.0, False)]
+)
+def test_seconds_that_hardly_are_are_doubted(name, apart, doubted):
+    table = {name: np.arange(8) * apart, "x": P[:, 0], "y": P[:, 1]}
+    reading = read_recordings([Source("pen.csv", content=text(table))], format="csv")
+    assert ("--time-unit ms" in str(reading.notes[0])) is doubted
