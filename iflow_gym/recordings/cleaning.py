@@ -208,7 +208,8 @@ def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> Raw
             raise RecordingError(
                 f"Expected even samples of {recording.name}, because resampling was left out; they "
                 f"are {note.values['least_step_seconds']:.3g} to "
-                f"{note.values['longest_step_seconds']:.3g} s apart: resample them."
+                f"{note.values['longest_step_seconds']:.3g} s apart: resample them (leave out "
+                "--no-resample)."
             )
     return noted(steps.smoothed(recording, chosen.smooth, rough))
 

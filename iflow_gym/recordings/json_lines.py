@@ -62,7 +62,8 @@ def _objects(source: Source) -> list[dict[str, Any]]:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise RecordingError(
-            f"Expected {source.name} to be JSON lines in UTF-8, got other bytes at {error.start}."
+            f"Expected {source.name} to be JSON lines in UTF-8, got other bytes ({error.reason} at "
+            f"byte {error.start}): save it as UTF-8, or say what format it is (--format)."
         ) from error
     objects: list[Any]
     try:

@@ -47,7 +47,7 @@ def read(source: Source, columns: Columns) -> Reading:
     ) as error:
         raise RecordingError(
             f"Expected {source.name} to be a file of NumPy's (numpy.savez or numpy.save), got "
-            f"something else or a damaged one: {error}."
+            f"something else or a damaged one: {str(error).rstrip('.')}."
         ) from error
     return from_arrays(arrays, columns, source.name)
 

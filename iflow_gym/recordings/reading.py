@@ -42,6 +42,12 @@ class Source:
 
     def read(self) -> bytes:
         """Return the bytes, of a file of a size that memory can hold."""
+        content = self._content()
+        if not content:
+            raise RecordingError(f"Expected a recording in {self.name}, got an empty file.")
+        return content
+
+    def _content(self) -> bytes:
         if self.content is not None:
             return self.content
         assert self.path is not None

@@ -83,7 +83,7 @@ def read(source: Source, columns: Columns) -> Reading:
     except Exception as error:  # whatever rosbags, SQLite and the decoder make of other bytes
         raise RecordingError(
             f"Expected a ROS 2 bag at {source.name}, a folder with metadata.yaml, got something "
-            f"else or a damaged one: {str(error) or type(error).__name__}."
+            f"else or a damaged one: {str(error).rstrip('.') or type(error).__name__}."
         ) from error
 
 

@@ -43,9 +43,9 @@ def read(source: Source, columns: Columns) -> Reading:
         )
     rows, lines = _rows(text, columns.delimiter, source.name)
     if len(rows) < 2:
+        came = "a single line" if rows else "comments and empty lines alone"
         raise RecordingError(
-            f"Expected a table of samples in {source.name}, a line for each, got "
-            f"{'one line' if rows else 'no line'}."
+            f"Expected a table in {source.name}, a heading and a line for each sample, got {came}."
         )
     headed = any(_number(cell) is None for cell in rows[0])
     width = len(rows[0])
