@@ -32,6 +32,9 @@ class CleanUp:
     to_unit: Annotated[str | None, shown("UNIT")] = None
     """Unit of the demonstrations; by default the same. Another one than --unit scales: both are
     among m, dm, cm, mm, um, km, in."""
+    split: Annotated[float | None, shown("SECONDS")] = None
+    """Cut recordings at gaps in time longer than this: several demonstrations in a file. Shorter
+    gaps are bridged; without it, gaps that hide a piece of the motion are refused."""
     bad_times: BadTimes = "error"
     """Samples whose time repeats or goes back: "error" or "drop"."""
     missing: Missing = "drop"
@@ -123,6 +126,8 @@ def clean(
     if factor != 1.0:
         text = f"scaled by {factor:g}, from {came_in} to {unit}"
         notes.append(Note("units", "", text, {"factor": factor}))
+    if chosen.split is not None:
+        before = _split(before, chosen.split, notes)
     done = [_cleaned(r, chosen, notes) for r in before]
     if chosen.hold_out and not 0 <= chosen.hold_out < len(done):
         raise RecordingError(
@@ -174,6 +179,18 @@ def clean(
     return Cleaned(demonstrations, tuple(notes), before, tuple(done))
 
 
+def _split(
+    recordings: Sequence[RawRecording], seconds: float, notes: list[Note]
+) -> tuple[RawRecording, ...]:
+    """Return the pieces of all recordings, times from 0, and append what was split."""
+    done: list[RawRecording] = []
+    for recording in recordings:
+        pieces, note = steps.split_at_gaps(recording, seconds)
+        done += [steps.scaled(p) for p in pieces]
+        notes += [note] if note is not None else []
+    return tuple(done)
+
+
 def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> RawRecording:
     """Return what concerns one recording alone done to it, and append what was done."""
 
@@ -183,6 +200,8 @@ def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> Raw
         return done[0]
 
     recording = noted(steps.in_order(recording, chosen.bad_times))
+    if chosen.split is None:
+        steps.check_gaps(recording)
     recording = noted(steps.without_gaps(recording, chosen.missing))
     if len(recording) < LEAST_SAMPLES:
         raise RecordingError(

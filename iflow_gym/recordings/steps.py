@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -40,6 +41,13 @@ SHARE = 0.07
 MOVES = 1.5
 """It is narrowed until it moves samples by no more than so many times their scatter: what it moves
 beyond that is the motion. A recording of many rounds is cut off at its corners otherwise."""
+
+GAP_SAMPLES = 30
+"""A sensor loses a few samples in a row; a gap of more sample times than these is looked at."""
+
+GAP_SHARE = 0.1
+"""A gap of more than this fraction of the longest stretch without one hides a piece of the motion
+that a cubic cannot know: from a tenth of a motion on, samples of a whole turn may be lost."""
 
 ORDER = 3
 """Of the polynomials of Savitzky and Golay."""
@@ -99,6 +107,73 @@ def in_order(
         {"repeated": repeated, "backward": backward},
     )
     return recording.take(~bad), note
+
+
+def split_at_gaps(
+    recording: RawRecording, seconds: float
+) -> tuple[list[RawRecording], Note | None]:
+    """Return the pieces between gaps in time that are longer than so many seconds."""
+    if not seconds > 0:
+        raise RecordingError(f"Expected gaps > 0 in seconds to split at (--split), got {seconds}.")
+    rows = np.flatnonzero(recording.whole)
+    gaps = _gaps(recording)
+    wide = gaps > seconds
+    if not wide.any():
+        return [recording], None
+    edges = [0, *(rows[1:][wide]), len(recording)]
+    pieces = [
+        replace(recording.take(slice(begin, end)), name=f"{recording.name}, part {i}")
+        for i, (begin, end) in enumerate(pairwise(edges), start=1)
+    ]
+    count, least, most = int(wide.sum()), float(gaps[wide].min()), float(gaps[wide].max())
+    long = (
+        f"a gap of {most:.3g} s" if count == 1 else f"{count} gaps of {least:.3g} to {most:.3g} s"
+    )
+    values = {"recordings": len(pieces), "least_gap_seconds": least, "longest_gap_seconds": most}
+    return pieces, Note("split", recording.name, f"split in {len(pieces)} at {long}", values)
+
+
+def check_gaps(recording: RawRecording) -> None:
+    """Raise RecordingError for a gap in time out of all proportion, across which something moved.
+
+    That is one of more than `GAP_SAMPLES` sample times (the median) and `GAP_SHARE` of the longest
+    stretch without one. Where nothing moved across it, a recorder that writes changes only was
+    waiting. Call `in_order` first.
+    """
+    kept = recording.take(recording.whole)
+    gaps = _gaps(recording)
+    if len(gaps) < LEAST_SAMPLES:
+        return
+    usual = float(np.median(gaps))
+    wide = np.flatnonzero(gaps > GAP_SAMPLES * usual)
+    ends = kept.times[np.concatenate([wide, [len(kept) - 1]])]
+    stretch = float((ends - kept.times[np.concatenate([[0], wide + 1])]).max())
+    way = np.linalg.norm(kept.positions[wide + 1] - kept.positions[wide], axis=1)
+    wide = wide[(gaps[wide] > GAP_SHARE * stretch) & (way > LEAST_WAY * recording.diagonal)]
+    if not len(wide):
+        return
+    at = wide[int(np.argmax(gaps[wide]))]
+    several = f"{len(wide)} gaps, the longest" if len(wide) > 1 else "a gap"
+    raise RecordingError(
+        f"Expected samples of one motion in {recording.name}, some {usual:.3g} s apart, got "
+        f"{several} of {gaps[at]:.3g} s, from {kept.times[at]:.5g} to {kept.times[at + 1]:.5g} s, "
+        "in which the position changed: what happened there nobody knows. If these are several "
+        f"recordings, split them there (--split {_one_digit(gaps[wide].min() / 2):g}) or name the column that tells them "
+        f"apart (--group); to bridge gaps, split at longer ones only (--split "
+        f"{_one_digit(gaps[at], 1):g})."
+    )
+
+
+def _gaps(recording: RawRecording) -> FloatArray:
+    """Return the seconds from the latest whole sample so far to each that follows."""
+    times = recording.times[recording.whole]
+    return np.asarray(times[1:] - np.maximum.accumulate(times)[:-1])
+
+
+def _one_digit(value: float, more: int = 0) -> float:
+    """Return a value cut to its first digit, or so much more in that digit."""
+    digit = 10 ** np.floor(np.log10(value))
+    return float((np.floor(value / digit) + more) * digit)
 
 
 def without_gaps(

@@ -162,6 +162,19 @@ def test_a_cycle_of_ones_own_is_scored_as_one():
     ]
 
 
+def test_strokes_in_one_recording_are_split_into_demonstrations():
+    stroke = raw(load_lasa("Angle"), every=10)[0]
+    times = np.concatenate([stroke.times + i * (stroke.times[-1] + 3.0) for i in range(3)])
+    one = RawRecording("one", times, np.tile(stroke.positions, (3, 1)))
+    with pytest.raises(RecordingError, match="--split 1"):
+        clean([one], CleanUp())
+    cleaned = clean([one], CleanUp(split=1.0))
+    assert len(cleaned.demonstrations) == len(cleaned.before) == 3
+    assert cleaned.demonstrations.goal is not None
+    assert [r.times[0] for r in cleaned.before] == [0.0, 0.0, 0.0]
+    assert len(clean([one], CleanUp(split=9.0, kind="cycle", cut=False)).demonstrations) == 1
+
+
 # The file -----------------------------------------------------------------------------------
 
 
