@@ -47,13 +47,18 @@ def main() -> NoReturn:
 
 def run(arguments: list[str]) -> int:
     """Run a command and return its exit status; errors of the user's are told in a sentence."""
-    from iflow_gym.cli.commands import parse
     from iflow_gym.cli.console import UsageError, complain
 
+    if getattr(sys, "stderr", None) is None:  # closed by who called: 2>&-
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (until the end)
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # for --method my_module:MyMethod
     command: Command | None = None
     try:
+        from iflow_gym.cli.commands import parse  # here: an interrupt meets it, too
+
+        if getattr(sys, "stdout", None) is None:
+            raise UsageError("Expected a standard output, got a closed one: > /dev/null drops it.")
         command = parse(arguments, DESCRIPTION)
         status = command.run()
         sys.stdout.flush()
@@ -77,9 +82,9 @@ def _told(error: BaseException, status: int) -> int:
     if os.environ.get("IFLOW_GYM_DEBUG"):
         raise error
     text = str(error) or type(error).__name__
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+    if isinstance(error, OSError) and error.strerror:
         # What is written is complete under another name first.
-        name = re.sub(r"\.\d+\.partial", "", str(error.filename))
-        text = f"Expected to read or write {name}, got: {error.strerror}. Look at the path."
+        name = re.sub(r"\.\d+\.partial", "", str(error.filename or "the data"))
+        text = f"Expected to read or write {name}, got: {error.strerror}."
     complain(text)
     return status

@@ -109,8 +109,9 @@ def input_path(path: str) -> Iterator[Path]:
 
 def input_bytes() -> bytes:
     """Return standard input."""
-    if sys.stdin.isatty():
-        raise UsageError("Expected a file on standard input (-), got a terminal.")
+    if sys.stdin is None or sys.stdin.isatty():
+        came = "a closed one" if sys.stdin is None else "a terminal"
+        raise UsageError(f"Expected a file on standard input (-), got {came}.")
     return sys.stdin.buffer.read()
 
 

@@ -8,11 +8,14 @@ import re
 import socket
 import subprocess
 import sys
+import sysconfig
+from importlib import metadata
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from iflow_gym.cli import run
+from iflow_gym.cli import main, run
 from iflow_gym.cli.commands import COMMANDS
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstration_files import load_demonstrations, save_demonstrations
@@ -92,6 +95,22 @@ def test_help_imports_nothing_heavy():
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_installed_script_is_the_command(folder):
+    """The one that pip makes of pyproject.toml's entry, where the tests run."""
+    (entry,) = metadata.entry_points(group="console_scripts", name="iflow-gym")
+    assert entry.load() is main
+    script = Path(sysconfig.get_path("scripts")) / "iflow-gym"
+    if not script.exists():
+        pytest.skip("the package is imported from a folder, and not installed")
+    done = subprocess.run(
+        [script, "fit", "LASA-Angel", "-o", "m"], cwd=folder, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("iflow-gym: Expected a motion")
+    assert "Did you mean LASA-Angle" in done.stderr
 
 
 def test_completion_knows_the_commands(call):
@@ -438,3 +457,21 @@ def test_who_has_read_enough_is_not_complained_to(folder):
     assert done.stdout.splitlines()[0] == b"start,t,x,y,vx,vy"
     assert done.stderr == b""
     assert done.returncode == 141
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "said"),
+    [
+        ("iflow-gym methods >&-", 2, b"Expected a standard output, got a closed one"),
+        ("iflow-gym fit - -o m <&-", 2, b"Expected a file on standard input (-), got a closed one"),
+        ("iflow-gym fit nothing -o m 2>&-", 2, b""),
+        ("iflow-gym methods > /dev/full", 1, b"got: No space left on device."),
+    ],
+)
+def test_closed_and_full_streams_are_told(folder, line, status, said):
+    if "/dev/full" in line and not Path("/dev/full").exists():
+        pytest.skip("there is no device that is full")
+    done = piped(folder, line)
+    assert (done.returncode, done.stdout) == (status, b"")
+    assert said in done.stderr
+    assert b"Traceback" not in done.stderr
