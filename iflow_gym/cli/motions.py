@@ -94,3 +94,21 @@ def load_model_file(path: str, method: str | None) -> tuple[Method, dict[str, ob
         )
     with input_path(path) as file:
         return load_model(file, method=method), inspect_model(file).fit
+
+
+def check_match(
+    method: Method, record: dict[str, object] | None, demonstrations: Demonstrations
+) -> None:
+    """Raise UsageError for a model and a motion of different dimension or unit of length."""
+    if method.n_dims_ != demonstrations.n_dims:
+        raise UsageError(
+            f"Expected a model and a motion of the same dimension, got {method.n_dims_} and "
+            f"{demonstrations.n_dims}."
+        )
+    unit = (record or {}).get("length_unit")
+    if isinstance(unit, str) and unit != demonstrations.length_unit:
+        raise UsageError(
+            f"Expected a model and a motion of the same unit of length, got a model in {unit} and "
+            f"a motion in {demonstrations.length_unit}: import the recordings in the model's unit "
+            f"(iflow-gym import --to-unit {unit})."
+        )

@@ -65,7 +65,7 @@ class Rollout:
         """Roll out."""
         import numpy as np
 
-        from iflow_gym.cli.motions import load_model_file, load_motion
+        from iflow_gym.cli.motions import check_match, load_model_file, load_motion
 
         only_one_pipe(self.model, self.starts or "", self.motion or "")
         if self.output != PIPE:
@@ -78,11 +78,7 @@ class Rollout:
         dt, duration = self.dt, self.duration
         if self.motion is not None:
             demos, _ = load_motion(self.motion)
-            if demos.n_dims != d:
-                raise UsageError(
-                    f"Expected a model and a motion of the same dimension, got {d} and "
-                    f"{demos.n_dims}."
-                )
+            check_match(method, record, demos)
             starts += [] if starts else list(demos.starts)
             dt = demos.mean_dt if dt is None else dt
             if duration is None:

@@ -154,13 +154,14 @@ def check_gaps(recording: RawRecording) -> None:
         return
     at = wide[int(np.argmax(gaps[wide]))]
     several = f"{len(wide)} gaps, the longest" if len(wide) > 1 else "a gap"
+    begin, end = kept.times[at], kept.times[at + 1]
     raise RecordingError(
         f"Expected samples of one motion in {recording.name}, some {usual:.3g} s apart, got "
-        f"{several} of {gaps[at]:.3g} s, from {kept.times[at]:.5g} to {kept.times[at + 1]:.5g} s, "
-        "in which the position changed: what happened there nobody knows. If these are several "
-        f"recordings, split them there (--split {_one_digit(gaps[wide].min() / 2):g}) or name the column that tells them "
-        f"apart (--group); to bridge gaps, split at longer ones only (--split "
-        f"{_one_digit(gaps[at], 1):g})."
+        f"{several} of {gaps[at]:.3g} s, from {begin:.5g} to {end:.5g} s, in which the position "
+        "changed: what happened there nobody knows. If these are several recordings, split them "
+        f"there (--split {_one_digit(gaps[wide].min() / 2):g}) or name the column that tells them "
+        "apart (--group); to bridge gaps, split at longer ones only "
+        f"(--split {_one_digit(gaps[at], 1):g})."
     )
 
 

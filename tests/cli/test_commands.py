@@ -274,6 +274,25 @@ def test_score_is_the_evaluations(call, folder):
     assert told["recordings_seen_in_fit"] == 7
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "score linear.safetensors metres.safetensors",
+        "plot metres.safetensors --model linear.safetensors -o a.png",
+        "rollout linear.safetensors --motion metres.safetensors",
+    ],
+)
+def test_a_model_and_a_motion_of_different_units_are_refused(call, folder, line):
+    motion = load_demonstrations(folder / "angle.safetensors")
+    metres = Demonstrations.from_arrays(
+        [p / 1000 for p in motion.positions], dt=motion.dt, length_unit="m", goal_tolerance=1.0
+    )
+    save_demonstrations(metres, folder / "metres.safetensors")
+    status, output, said = call(*line.split())
+    assert (status, output) == (2, "")
+    assert "a model in mm and a motion in m: import" in said
+
+
 def test_score_prints_a_table_with_units_and_the_guarantee(call):
     status, output, _ = call("score", "dmp.safetensors", "angle.safetensors", "--no-stability")
     assert status == 0
