@@ -48,7 +48,7 @@ class Export:
             raise UsageError(
                 "Expected a file to write, got standard output, where the snippet goes."
             )
-        check_output(self.output, self.model)
+        check_output(self.output, self.model, suffix=".onnx")
         method, record = load_model_file(self.model, self.method)
         export = getattr(method, "export", None)
         if export is None:

@@ -84,7 +84,7 @@ class Fit:
 
         if self.json and self.output == PIPE:
             raise UsageError("Expected one thing for standard output, got the model and --json.")
-        check_output(self.output, self.motion)
+        check_output(self.output, self.motion, suffix=".safetensors")
         check_seed(self.seed)
         if self.preset not in (None, "smoke", "standard", "full"):
             raise UsageError(

@@ -45,7 +45,8 @@ class Import:
     sources: Annotated[Positional[tuple[str, ...]], shown("FILE...")]
     """Files of recordings, in their order; - reads standard input (with --format)."""
     output: Annotated[str, arg(metavar="FILE", aliases=["-o"])]
-    """File of demonstrations to write, such as reach.safetensors; - writes standard output."""
+    """File of demonstrations to write, such as reach.safetensors, over one that is there already; -
+    writes standard output."""
     format: Annotated[str | None, shown("FORMAT")] = None
     """Format of the sources, where names do not tell: csv, npz, jsonl, mat, rosbag, minari."""
     plot: Annotated[str | None, shown("PICTURE")] = None
@@ -84,7 +85,7 @@ class Import:
                 f"Expected each file of recordings once, got {again[0]} again: every demonstration "
                 "counts as one."
             )
-        check_output(self.output, *self.sources)
+        check_output(self.output, *self.sources, suffix=".safetensors")
         if self.plot is not None:
             check_picture(self.plot)
         sources = [

@@ -69,7 +69,8 @@ class Rollout:
 
         only_one_pipe(self.model, self.starts or "", self.motion or "")
         if self.output != PIPE:
-            check_output(self.output, self.model, self.starts or "", self.motion or "")
+            inputs = (self.model, self.starts or "", self.motion or "")
+            check_output(self.output, *inputs, suffix=".csv")
         method, record = load_model_file(self.model, self.method)
         d = method.n_dims_
         starts = [_vector(text, d, "--start") for text in self.start]
@@ -118,7 +119,10 @@ class Rollout:
         if self.output == PIPE:
             _write(sys.stdout, heading, times, paths, velocities)
             return 0
-        with output_path(self.output) as path, path.open("w", newline="", encoding="utf-8") as file:
+        with (
+            output_path(self.output, ".csv") as path,
+            path.open("w", newline="", encoding="utf-8") as file,
+        ):
             _write(file, heading, times, paths, velocities)
         say(f"{len(starts)} rollouts of {n_steps} steps of {dt:g} s. Written to {self.output}.")
         return 0

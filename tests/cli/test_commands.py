@@ -153,6 +153,10 @@ def test_completion_knows_the_commands(call):
         (["import", "reach.csv", "reach.csv", "-o", "a"], "reach.csv again"),
         (["import", "reach.csv", "-o", "a", "--plot", "a.gif"], ".png"),
         (["import", "reach.csv", "-o", "a", "--format", "xyz"], "csv, npz"),
+        (["import", "reach.csv", "-o", "mine.csv"], "such as mine.safetensors"),
+        (["fit", "angle.safetensors", "-o", "m.onnx"], "such as m.safetensors"),
+        (["export", "linear.safetensors", "-o", "a.safetensors"], "such as a.onnx"),
+        (["rollout", "linear.safetensors", "--start", "1,2", "-o", "a.png"], "such as a.csv"),
         (["fit", "angle.safetensors", "-o", "angle.safetensors"], "which is one of them"),
         (["fit", "angle.safetensors", "-o", ""], "an empty name"),
         (["fit", "angle.safetensors", "-o", "m", "--seed", "-1"], "seed >= 0"),
@@ -224,6 +228,12 @@ def test_import_reports_draws_and_writes(call, folder):
     assert {"columns", "units", "kind"} <= {entry["step"] for entry in report["report"]}
     assert all(entry["text"] in said for entry in report["report"])
     assert (folder / "reach.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_was_there_and_is_replaced_is_said(call):
+    line = ("import", "reach.csv", "-o", "twice.safetensors")
+    assert "Replaced" not in call(*line)[2]
+    assert "Replaced twice.safetensors, which was there already." in call(*line)[2]
 
 
 def test_fit_writes_a_model_that_says_what_it_was_fitted_on(call, folder):
