@@ -120,6 +120,8 @@ class Import:
             f"{demos.name}: {len(demos)} demonstration{'s' * (len(demos) > 1)} of {samples} "
             f"samples in {demos.n_dims} dimensions, which {ends}. Written to {_named(self.output)}."
         )
+        if len(demos) == 1:
+            say("One recording alone: nothing shows its spread, and none is left to score unseen.")
         if self.json:
             print_json(
                 {

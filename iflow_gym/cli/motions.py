@@ -35,9 +35,11 @@ def environment_id(name: str) -> str | None:
 def load_motion(name: str) -> tuple[Demonstrations, str | None]:
     """Return the demonstrations of a file, of ``-``, or of an environment, and that one's id."""
     from iflow_gym.demonstration_files import (
+        DemonstrationFileError,
         demonstrations_from_bytes,
         load_demonstrations,
     )
+    from iflow_gym.recordings.reading import SUFFIXES
 
     if name == PIPE:
         return demonstrations_from_bytes(input_bytes(), "standard input").demonstrations, None
@@ -49,7 +51,15 @@ def load_motion(name: str) -> tuple[Demonstrations, str | None]:
 
         env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
         return env.demonstrations, env_id  # type: ignore[attr-defined]
-    return load_demonstrations(name), None
+    try:
+        return load_demonstrations(name), None
+    except DemonstrationFileError as error:
+        if Path(name).suffix.lower() in SUFFIXES:
+            raise ValueError(
+                f"Expected demonstrations, which `iflow-gym import` wrote, got {name}, a recording "
+                f"by its name. First: iflow-gym import {name} -o {Path(name).stem}.safetensors"
+            ) from error
+        raise
 
 
 def _unknown(name: str) -> str:

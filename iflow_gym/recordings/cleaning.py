@@ -128,7 +128,7 @@ def clean(
         notes.append(Note("units", "", text, {"factor": factor}))
     if chosen.split is not None:
         before = _split(before, chosen.split, notes)
-    done = [_cleaned(r, chosen, notes) for r in before]
+    done = [_cleaned(r, chosen, unit, notes) for r in before]
     if chosen.hold_out and not 0 <= chosen.hold_out < len(done):
         raise RecordingError(
             f"Expected to hold out from 0 to {len(done) - 1} recordings, one less than there are, "
@@ -169,9 +169,9 @@ def clean(
                 notes.append(note)
     else:
         goal = _goal(chosen, done[0].n_dims)
-        done, moved = steps.aligned(done, chosen.align, goal)
+        done, moved = steps.aligned(done, chosen.align, goal, unit)
         notes += moved
-        _check_ends(done, goal, chosen)
+        _check_ends(done, goal, chosen, unit)
     try:
         demonstrations = _demonstrations(done, chosen, unit, period, source)
     except (TypeError, ValueError) as error:
@@ -191,7 +191,9 @@ def _split(
     return tuple(done)
 
 
-def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> RawRecording:
+def _cleaned(
+    recording: RawRecording, chosen: CleanUp, unit: str, notes: list[Note]
+) -> RawRecording:
     """Return what concerns one recording alone done to it, and append what was done."""
 
     def noted(done: tuple[RawRecording, Note | None]) -> RawRecording:
@@ -230,7 +232,7 @@ def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> Raw
                 f"{note.values['longest_step_seconds']:.3g} s apart: resample them (leave out "
                 "--no-resample)."
             )
-    return noted(steps.smoothed(recording, chosen.smooth, rough))
+    return noted(steps.smoothed(recording, chosen.smooth, rough, unit))
 
 
 def _scale(unit: str, to_unit: str | None) -> tuple[float, str]:
@@ -260,6 +262,7 @@ def _check_ends(
     done: Sequence[RawRecording],
     goal: np.ndarray[Any, np.dtype[np.float64]] | None,
     chosen: CleanUp,
+    unit: str,
 ) -> None:
     ends = np.stack([r.positions[-1] for r in done])
     target = ends.mean(axis=0) if goal is None else goal
@@ -271,10 +274,10 @@ def _check_ends(
     away = np.linalg.norm(ends - target, axis=1)
     if away.max() > allowed:
         raise RecordingError(
-            f"Expected the recordings to end within {allowed:.3g} of one goal, "
+            f"Expected the recordings to end within {allowed:.3g} {unit} of one goal, "
             f"{np.array2string(target, precision=4)}, got {done[int(away.argmax())].name}, which "
-            f"ends {away.max():.3g} away: make them end there (--align shift moves them, --align "
-            "bend keeps their starts), give the goal (--goal), or accept the spread "
+            f"ends {away.max():.3g} {unit} away: make them end there (--align shift moves them, "
+            "--align bend keeps their starts), give the goal (--goal), or accept the spread "
             "(--goal-tolerance). Of a motion that repeats say --kind cycle."
         )
 

@@ -42,6 +42,9 @@ MOVES = 1.5
 """It is narrowed until it moves samples by no more than so many times their scatter: what it moves
 beyond that is the motion. A recording of many rounds is cut off at its corners otherwise."""
 
+MOST_CUT = 0.25
+"""What leads over more than this fraction of the diagonal is a motion, however slow it is."""
+
 GAP_SAMPLES = 30
 """A sensor loses a few samples in a row; a gap of more sample times than these is looked at."""
 
@@ -272,6 +275,15 @@ def trimmed(recording: RawRecording, still: float = STILL) -> tuple[RawRecording
     if start + end == 0 or inside.sum() < LEAST_SAMPLES:
         return recording, None
     kept = recording.take(slice(start, n - end))
+    cut = [recording.take(slice(0, start + 1)), recording.take(slice(n - end - 1, n))]
+    share = max(r.diagonal for r in cut) / recording.diagonal
+    if share > MOST_CUT:
+        raise RecordingError(
+            f"Expected still stretches to cut off {recording.name}, got {start + end} of {n} "
+            f"samples below {still:g} of the fast speed, which lead over {share:.0%} of its "
+            "diagonal: count less as still (--still 0.03 by default), or cut nothing off "
+            "(--no-trim)."
+        )
     times = recording.times
     seconds = (float(times[start] - times[0]), float(times[-1] - times[n - 1 - end]))
     parts = [
@@ -362,7 +374,10 @@ def scatter(recording: RawRecording) -> float:
 
 
 def smoothed(
-    recording: RawRecording, window: float | None = None, roughness: float | None = None
+    recording: RawRecording,
+    window: float | None = None,
+    roughness: float | None = None,
+    unit: str = "",
 ) -> tuple[RawRecording, Note | None]:
     """Return the recording with positions and velocities of cubics fitted to a moving window.
 
@@ -379,6 +394,8 @@ def smoothed(
         less than `SCATTER` of the diagonal.
     roughness : float, optional
         What `scatter` says of the recording before it was resampled; by default of this one.
+    unit : str
+        Of length, for the note.
 
     Notes
     -----
@@ -429,9 +446,10 @@ def smoothed(
         speeds = filtered(recording.velocities)
     moved = np.linalg.norm(positions - recording.positions, axis=1)
     rms, most = float(np.sqrt(np.mean(moved**2))), float(moved.max())
+    own = unit and f" {unit}"
     text = (
         f"smoothed by cubics over {samples * step:.3g} s ({samples} samples), which moved samples "
-        f"by {rms:.3g} RMS and {most:.3g} at most; they scattered by {rough:.3g}"
+        f"by {rms:.3g}{own} RMS and {most:.3g}{own} at most; they scattered by {rough:.3g}{own}"
     )
     values = {
         "window_seconds": samples * step,
@@ -464,7 +482,7 @@ def scaled(
 
 
 def aligned(
-    recordings: Sequence[RawRecording], how: Align, goal: FloatArray | None = None
+    recordings: Sequence[RawRecording], how: Align, goal: FloatArray | None = None, unit: str = ""
 ) -> tuple[list[RawRecording], list[Note]]:
     """Return recordings that all end at one goal.
 
@@ -476,6 +494,8 @@ def aligned(
         start, in proportion to the way covered; ``"none"`` nothing.
     goal : array, shape (d,), optional
         By default the mean of the ends.
+    unit : str
+        Of length, for the notes.
     """
     if how == "none":
         return list(recordings), []
@@ -500,7 +520,7 @@ def aligned(
         positions[-1] = target
         done.append(replace(recording, positions=positions, velocities=speeds))
         word = "shifted" if how == "shift" else "bent"
-        text = f"{word} by {far:.4g} to end at the goal"
+        text = f"{word} by {far:.4g}{unit and f' {unit}'} to end at the goal"
         notes.append(Note("align", recording.name, text, {"how": how, "distance": far}))
     return done, notes
 

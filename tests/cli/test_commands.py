@@ -52,6 +52,7 @@ def folder(tmp_path_factory):
         method = "linear" if name == "part" else name
         arguments = [f"{path}/angle.safetensors", "-o", f"{path}/{name}.safetensors"]
         assert run(["fit", *arguments, "--method", method, *more]) == 0
+    load_model(path / "linear.safetensors").save(path / "bare.safetensors")
     return path
 
 
@@ -143,7 +144,11 @@ def test_completion_knows_the_commands(call):
         (["data", "where", "nothing"], "nothing"),
         (["rollout", "linear.safetensors"], "--start"),
         (["rollout", "linear.safetensors", "--start", "1"], "2 numbers"),
-        (["rollout", "linear.safetensors", "--start", "1,2"], "--duration"),
+        (["rollout", "bare.safetensors", "--start", "1,2"], "(--dt), got none"),
+        (
+            ["rollout", "bare.safetensors", "--start", "1,2", "--dt", "1"],
+            "demonstrations), got none",
+        ),
         (["rollout", "linear.safetensors", "--motion", "angle.safetensors", "--push", "1"], "t:dx"),
         (["plot", "angle.safetensors", "-o", "a.gif"], ".png"),
         (["plot", "angle.safetensors", "-o", "a.png", "--grid", "4"], "--model"),
@@ -191,7 +196,7 @@ def test_what_is_not_understood_is_2_and_says_why(call, arguments, message):
     [
         (["import", "absent.csv", "-o", "a"], "absent.csv"),
         (["import", "reach.csv", "-o", "a", "--time", "stamp"], "'stamp'"),
-        (["fit", "reach.csv", "-o", "m"], "iflow-gym import"),
+        (["fit", "reach.csv", "-o", "m"], "import reach.csv -o reach.safetensors"),
         (["score", "absent", "angle.safetensors"], "Expected a model at absent"),
         (["fit", "angle.safetensors", "-o", "m", "--set", "device=tpu"], "could not be fitted"),
         (["draw", "--no-open", "--port", "70000"], "from 0 to 65535"),
@@ -228,6 +233,12 @@ def test_import_reports_draws_and_writes(call, folder):
     assert {"columns", "units", "kind"} <= {entry["step"] for entry in report["report"]}
     assert all(entry["text"] in said for entry in report["report"])
     assert (folder / "reach.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_one_recording_alone_is_said_to_be_one(call, folder):
+    (folder / "one.csv").write_text(CSV.rpartition("0.000,")[0])
+    assert "One recording alone" in call("import", "one.csv", "-o", "one.safetensors")[2]
+    assert "One recording alone" not in call("import", "reach.csv", "-o", "two.safetensors")[2]
 
 
 def test_what_was_there_and_is_replaced_is_said(call):
@@ -364,6 +375,9 @@ def test_a_rollouts_velocity_is_the_slope_of_its_path(call):
 
 def test_rollouts_from_a_file_of_starts_and_of_a_motion(call, folder):
     (folder / "starts.csv").write_text("x,y\n-40,20\n10;10\n")
+    _, output, _ = call("rollout", "linear.safetensors", "--start=-40,20")
+    longest = load_demonstrations(folder / "angle.safetensors").durations.max()
+    assert rows(output)[-1]["t"] == pytest.approx(longest, rel=0.02)
     times = ("--dt", "0.1", "--duration", "0.2")
     _, output, _ = call("rollout", "linear.safetensors", "--starts", "starts.csv", *times)
     assert len(rows(output)) == 6

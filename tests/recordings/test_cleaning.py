@@ -1,6 +1,7 @@
 """The whole clean-up, the kind of motion, and the file that comes of it."""
 
 import contextlib
+import re
 
 import numpy as np
 import pytest
@@ -117,6 +118,9 @@ def test_everything_that_is_done_is_noted():
     cleaned = clean(recordings, options)
     steps = [n.step for n in cleaned.notes if n.recording in ("", "a")]
     assert steps == ["units", "times", "missing", "trim", "resample", "smooth", "kind", "align"]
+    texts = {n.step: n.text for n in cleaned.notes if n.recording == "a"}
+    assert re.search(r"by [\d.e-]+ m RMS and .* m at most; .* by [\d.e-]+ m$", texts["smooth"])
+    assert re.fullmatch(r"shifted by [\d.]+ m to end at the goal", texts["align"])
     motion = cleaned.demonstrations
     assert motion.length_unit == "m"
     np.testing.assert_allclose(motion.goal, [0.0015, 0.05], atol=2e-3)
@@ -133,7 +137,8 @@ def test_everything_that_is_done_is_noted():
         ({"kind": "cycle", "align": "shift"}, "to have no goal"),
         ({"still": 2.0}, "still from 0 to below 1"),
         ({"hold_out": 7}, "--hold-out"),
-        ({"goal": (9.0, 9.0)}, "--align shift"),
+        ({"goal": (9.0, 9.0)}, r"within [\d.]+ mm of one goal.* mm away.*--align shift"),
+        ({"still": 0.9}, r"\d\d% of its diagonal: count less as still"),
         ({"period": -1.0}, "period > 0"),
     ],
 )
@@ -142,7 +147,7 @@ def test_options_that_do_not_fit_say_what_to_do(options, message):
         [circle(3.0)] if options.get("kind") == "cycle" else raw(load_lasa("Line"), every=10)
     )
     with pytest.raises(RecordingError, match=message):
-        clean(recordings, CleanUp(**options))
+        clean(recordings, CleanUp(**{"unit": "mm", **options}))
 
 
 def test_uneven_samples_are_refused_where_resampling_is_left_out():
