@@ -86,6 +86,12 @@ def test_every_command_has_help(call, name):
         assert len(re.findall(rf"^    .*iflow-gym {name}", output, flags=re.M)) >= 1
 
 
+def test_the_version_is_the_packages(call):
+    from importlib.metadata import version
+
+    assert call("--version") == (0, f"iflow-gym {version('iflow-gym')}\n", "")
+
+
 def test_help_imports_nothing_heavy():
     script = (
         "import sys\nfrom iflow_gym.cli import run\n"
