@@ -113,6 +113,7 @@ class Fit:
                 "protocol": self.protocol,
                 "recordings": [digest(p) for p in demonstrations.positions],
                 "mean_dt": demonstrations.mean_dt,
+                "start": demonstrations.starts[0].tolist(),
                 "longest": float(demonstrations.durations.max()),
                 "seed": self.seed,
                 "fit_cpu_seconds": round(cpu, 3),

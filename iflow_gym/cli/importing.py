@@ -109,10 +109,11 @@ class Import:
 
             save_picture(cleaning_figure(cleaned), self.plot)
         demos = cleaned.demonstrations
+        s = "" if len(demos) > 1 else "s"
         ends = (
-            f"ends at {' '.join(f'{g:.4g}' for g in demos.goal)} {demos.length_unit}"
+            f"end{s} at {' '.join(f'{g:.4g}' for g in demos.goal)} {demos.length_unit}"
             if demos.goal is not None
-            else f"repeats every {demos.period:.4g} s"
+            else f"repeat{s} every {demos.period:.4g} s"
         )
         counts = sorted({len(p) for p in demos.positions})
         samples = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"

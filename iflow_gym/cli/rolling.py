@@ -95,8 +95,8 @@ class Rollout:
             came = "none" if dt is None else dt
             raise UsageError(f"Expected a time step > 0 in seconds (--dt), got {came}.")
         if duration is None:
-            rounds = method.period_ is not None
-            duration = 2 * method.period_ if rounds else _said(record, "longest")
+            period = method.period_
+            duration = _said(record, "longest") if period is None else 2 * period
         if duration is None or not (np.isfinite(duration) and duration >= dt):
             raise UsageError(
                 f"Expected a duration of at least one step of {dt:g} s (--duration, or --motion "

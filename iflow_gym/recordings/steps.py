@@ -106,7 +106,7 @@ def in_order(
     note = Note(
         "times",
         recording.name,
-        f"dropped {bad.sum()} samples of {len(recording)} with {counts} time stamps",
+        f"dropped {bad.sum()} of {len(recording)} samples by their times: {counts}",
         {"repeated": repeated, "backward": backward},
     )
     return recording.take(~bad), note

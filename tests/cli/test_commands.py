@@ -419,6 +419,24 @@ def test_plot_draws_motions_in_space_over_time(call, folder):
     assert call("plot", "space", "-o", "space.png", "--model", "linear.safetensors")[0] == 2
 
 
+def test_an_exported_file_says_what_a_controller_asks_for(call, folder):
+    pytest.importorskip("onnx")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    line = ("fit", "angle.safetensors", "-o", "flow.safetensors", "--set", "n_steps=2")
+    assert call(*line)[0] == 0
+    status, output, said = call("export", "flow.safetensors", "-o", "flow.onnx")
+    assert (status, "of the states' size" in said) == (0, True)
+    motion = load_demonstrations(folder / "angle.safetensors")
+    start = [round(float(c), 6) for c in motion.starts[0]]
+    assert f"x = np.array([{start}])  # where you are, in mm" in output
+    session = onnxruntime.InferenceSession(str(folder / "flow.onnx"))
+    about = {k: json.loads(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
+    assert (about["length_unit"], about["goal"]) == ("mm", pytest.approx(motion.goal.tolist()))
+    assert about["sample_time"] == pytest.approx(motion.mean_dt)
+    assert "period" not in about
+    exec(output, {})  # what it prints runs
+
+
 def test_methods_lists_all_and_the_settings_of_one(call):
     from iflow_gym.baselines.registry import METHODS
 

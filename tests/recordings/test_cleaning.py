@@ -21,6 +21,7 @@ from iflow_gym.demonstration_files import (
 )
 from iflow_gym.recordings import CleanUp, RawRecording, RecordingError, clean
 from iflow_gym.recordings.kinds import cut_to_rounds, decide
+from iflow_gym.recordings.picture import cleaning_figure
 
 
 def raw(demonstrations, every=1):
@@ -178,6 +179,20 @@ def test_strokes_in_one_recording_are_split_into_demonstrations():
     assert cleaned.demonstrations.goal is not None
     assert [r.times[0] for r in cleaned.before] == [0.0, 0.0, 0.0]
     assert len(clean([one], CleanUp(split=9.0, kind="cycle", cut=False)).demonstrations) == 1
+
+
+@pytest.mark.parametrize("tall", [0.1, 0.5, 1.0])
+def test_the_picture_of_a_flat_motion_has_no_white_bands(tall):
+    s = np.linspace(0, 1, 60)[:, None]
+    path = (1 - s) * [1.0, 0.0] + np.sin(np.pi * s) * [0.0, tall]
+    cleaned = clean([RawRecording("a", s[:, 0], path)], CleanUp(kind="goal", trim=False))
+    figure = cleaning_figure(cleaned)
+    figure.draw_without_rendering()
+    drawn = figure.axes[0].get_position()
+    room = figure.axes[0].get_position(original=True)
+    inches = figure.get_size_inches()[1]
+    assert (room.height - drawn.height) * inches < 0.8
+    assert inches <= 6.6
 
 
 # The file -----------------------------------------------------------------------------------
