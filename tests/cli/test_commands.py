@@ -86,6 +86,30 @@ def test_every_command_has_help(call, name):
         assert len(re.findall(rf"^    .*iflow-gym {name}", output, flags=re.M)) >= 1
 
 
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("import", "Another one than --unit scales: both are among m, dm, cm"),
+        ("fit", "or the first four sevenths, so that `score` can take the rest"),
+        ("data export-minari", "Write demonstrations as Minari datasets, such as"),
+        ("leaderboard run", "Seeds; the preset's by default. Methods without"),
+        ("leaderboard check", "Check a submission: method.toml, records"),
+    ],
+)
+def test_helps_texts_are_there_once_and_wrapped_as_paragraphs(call, monkeypatch, line, text):
+    monkeypatch.setenv("COLUMNS", "400")
+    status, output, _ = call(*line.split(), "--help")
+    assert (status, sum(text in one for one in output.splitlines())) == (0, 1)
+    assert "(default: )" not in output
+
+
+def test_a_group_lists_its_commands(call):
+    status, output, _ = call("data", "--help")
+    assert (status, "export-minari" in output, "iflow-gym data fetch" in output) == (0, True, True)
+    assert call("data")[0] == 2
+    assert call("data", "wher")[0] == 2
+
+
 def test_the_version_is_the_packages(call):
     from importlib.metadata import version
 
