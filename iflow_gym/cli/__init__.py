@@ -28,7 +28,7 @@ Every command has a --help of its own. Data go to standard output, all talk to s
 - stands for either where a file is asked for.
 
 Exit status: 0 it is done, 1 it could not be done, 2 the command was not understood.
-IFLOW_GYM_DEBUG=1 shows where an error came from.
+IFLOW_GYM_DEBUG=1 shows where an error came from. --version prints the version.
 
 Completion in bash (or zsh), once:
 
@@ -54,6 +54,11 @@ def run(arguments: list[str]) -> int:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # for --method my_module:MyMethod
     command: Command | None = None
+    if arguments == ["--version"]:
+        from iflow_gym import __version__
+
+        print(f"iflow-gym {__version__}")
+        return 0
     try:
         from iflow_gym.cli.commands import parse  # here: an interrupt meets it, too
 

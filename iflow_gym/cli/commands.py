@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Union
+import inspect
+from collections.abc import Mapping
+from typing import Annotated, Any, Union, get_args, get_type_hints
 
 import tyro
 from tyro.conf import DisallowNone, OmitSubcommandPrefixes, subcommand
@@ -14,6 +16,7 @@ from iflow_gym.cli.drawing import Draw
 from iflow_gym.cli.environments import Envs
 from iflow_gym.cli.exporting import Export
 from iflow_gym.cli.fitting import Fit, Methods
+from iflow_gym.cli.helping import say_in_help
 from iflow_gym.cli.importing import Import
 from iflow_gym.cli.plotting import Plot
 from iflow_gym.cli.rolling import Rollout
@@ -35,14 +38,23 @@ COMMANDS = {
 """By name, in the order of the help."""
 
 
-def parse(arguments: list[str], description: str) -> Command:
+def parse(
+    arguments: list[str],
+    description: str,
+    commands: Mapping[str, type[Any]] = COMMANDS,
+    prog: str = "iflow-gym",
+) -> Command:
     """Return the command of a line; prints help, or what was not understood, and exits."""
     command: Command
     name = arguments[0] if arguments else ""
-    if name in COMMANDS:  # its own help in full, and no time for the others
+    if name in commands:  # its own help in full, and no time for the others
+        cls = commands[name]
+        if group := _subcommands(cls):
+            return parse(arguments[1:], inspect.getdoc(cls) or "", group, f"{prog} {name}")
+        say_in_help(cls)
         command = tyro.cli(
-            COMMANDS[name],
-            prog=f"iflow-gym {name}",
+            cls,
+            prog=f"{prog} {name}",
             args=arguments[1:],
             config=(OmitSubcommandPrefixes, DisallowNone),
             use_underscores=False,
@@ -50,17 +62,23 @@ def parse(arguments: list[str], description: str) -> Command:
         return command
     choices = tuple(
         Annotated[cls, subcommand(name, description=_summary(cls))]
-        for name, cls in COMMANDS.items()
+        for name, cls in commands.items()
     )
     command = tyro.cli(  # type: ignore[call-overload]
         Union[choices],  # noqa: UP007 (made of a table)
-        prog="iflow-gym",
+        prog=prog,
         description=description,
         args=arguments,
         config=(OmitSubcommandPrefixes, DisallowNone),
         use_underscores=False,
     )
     return command
+
+
+def _subcommands(cls: type[Any]) -> dict[str, type[Any]]:
+    """Return the commands of a group, which are the alternatives of its field `command`."""
+    alternatives = get_args(get_type_hints(cls, include_extras=True).get("command"))
+    return {part.__metadata__[0].name: part.__origin__ for part in alternatives}
 
 
 def _summary(cls: type) -> str:

@@ -115,8 +115,11 @@ def input_bytes() -> bytes:
     return sys.stdin.buffer.read()
 
 
-def check_output(path: str, *inputs: str) -> None:
-    """Raise UsageError for what cannot be written to, or is one of the inputs."""
+def check_output(path: str, *inputs: str, suffix: str = "") -> None:
+    """Raise UsageError for what cannot be written to, is one of the inputs, or is named wrongly.
+
+    A name may end in anything but what says another format than the suffix.
+    """
     target = Path(path)
     if path == PIPE:
         if sys.stdout.isatty():
@@ -135,14 +138,30 @@ def check_output(path: str, *inputs: str) -> None:
         )
     elif any(target.exists() and Path(i).exists() and target.samefile(i) for i in inputs):
         raise UsageError(f"Expected an output beside the inputs, got {path}, which is one of them.")
+    elif suffix and _format(target.suffix.lower()) not in (None, _format(suffix)):
+        raise UsageError(
+            f"Expected a name in {suffix}, such as {target.stem}{suffix}, because that is what is "
+            f"written, got {path}."
+        )
+
+
+def _format(suffix: str) -> str | None:
+    """Return the format that a name's ending says, None for one that says nothing."""
+    from iflow_gym.recordings.reading import SUFFIXES
+
+    own = {s: s for s in (".safetensors", ".onnx", *PICTURES)}
+    return own.get(suffix) or SUFFIXES.get(suffix)
 
 
 @contextmanager
 def output_path(path: str, suffix: str = "") -> Iterator[Path]:
     """Give a path to write to; what is written for ``-`` goes to standard output afterwards."""
-    check_output(path)
+    check_output(path, suffix=suffix)
     if path != PIPE:
+        replaced = Path(path).exists()
         yield Path(path)
+        if replaced:
+            say(f"Replaced {path}, which was there already.")
         return
     with tempfile.TemporaryDirectory(prefix="iflow-gym-") as folder:
         target = Path(folder) / f"stdout{suffix}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -48,7 +49,7 @@ class Export:
             raise UsageError(
                 "Expected a file to write, got standard output, where the snippet goes."
             )
-        check_output(self.output, self.model)
+        check_output(self.output, self.model, suffix=".onnx")
         method, record = load_model_file(self.model, self.method)
         export = getattr(method, "export", None)
         if export is None:
@@ -58,10 +59,11 @@ class Export:
             )
         with output_path(self.output, ".onnx") as path:
             export(path, velocity=self.velocity)
+            _add_metadata(path, method, record)
             difference = _checked(method, path)
-        said = (
-            "" if difference is None else f" ONNX Runtime agrees to {difference:.1g} of the size."
-        )
+        said = ""
+        if difference is not None:
+            said = f" ONNX Runtime agrees with the model to {difference:.1g} of the states' size."
         say(f"{path.stat().st_size / 1024:.0f} KiB written to {self.output}.{said}")
         if difference is None:
             say("It was not checked, because onnxruntime is not installed here.")
@@ -70,8 +72,11 @@ class Export:
 
 
 def snippet(method: Method, path: str, velocity: bool, record: dict[str, Any] | None) -> str:
-    """Return the lines of Python that run an exported model, from its goal's side."""
-    start = [round(float(g) + 0.1 * max(abs(float(g)), 1.0), 6) for g in method.goal_]
+    """Return the lines of Python that run an exported model, from a start that was recorded."""
+    beside = [float(g) + 0.1 * max(abs(float(g)), 1.0) for g in method.goal_]
+    said = (record or {}).get("start")
+    known = isinstance(said, list) and len(said) == len(beside)
+    start = [round(float(c), 6) for c in (said if known else beside)]  # type: ignore[union-attr]
     dt = (record or {}).get("mean_dt")
     unit = (record or {}).get("length_unit")
     dt = dt if isinstance(dt, float) else 0.01
@@ -93,6 +98,23 @@ for _ in range(500):
     command = {command}  # what a velocity controller takes
     x = x_next  # in a loop with a robot: what it measures
 print(x[0])"""
+
+
+def _add_metadata(path: Path, method: Method, record: dict[str, Any] | None) -> None:
+    """Put into a file what a controller asks for: unit of length, sample time, goal or period."""
+    import onnx
+
+    said: dict[str, Any] = {
+        "length_unit": (record or {}).get("length_unit"),
+        "sample_time": (record or {}).get("mean_dt"),
+        "goal": method.goal_.tolist() if method.period_ is None else None,
+        "period": method.period_,
+    }
+    model = onnx.load(path)
+    for key, value in said.items():
+        if value is not None:
+            model.metadata_props.add(key=key, value=json.dumps(value))
+    path.write_bytes(model.SerializeToString())
 
 
 def _checked(method: Any, path: Path) -> float | None:

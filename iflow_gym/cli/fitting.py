@@ -7,7 +7,6 @@ import difflib
 import tomllib
 import types
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -32,6 +31,7 @@ from iflow_gym.cli.console import (
     progress,
     say,
 )
+from iflow_gym.cli.helping import field_texts
 from iflow_gym.recordings.columns import shown
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Fit:
 
         if self.json and self.output == PIPE:
             raise UsageError("Expected one thing for standard output, got the model and --json.")
-        check_output(self.output, self.motion)
+        check_output(self.output, self.motion, suffix=".safetensors")
         check_seed(self.seed)
         if self.preset not in (None, "smoke", "standard", "full"):
             raise UsageError(
@@ -113,6 +113,8 @@ class Fit:
                 "protocol": self.protocol,
                 "recordings": [digest(p) for p in demonstrations.positions],
                 "mean_dt": demonstrations.mean_dt,
+                "start": demonstrations.starts[0].tolist(),
+                "longest": float(demonstrations.durations.max()),
                 "seed": self.seed,
                 "fit_cpu_seconds": round(cpu, 3),
             }
@@ -181,7 +183,7 @@ class Methods:
             return 0
         cls = load_method_class(self.method)
         hints = get_type_hints(cls.Config)
-        texts = _texts(cls.Config)
+        texts = field_texts(cls.Config)
         fields = [
             {
                 "name": f.name,
@@ -289,31 +291,6 @@ def _type_name(hint: Any) -> str:
             words = {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}
             names.append(words.get(kind, str(kind)))
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
-
-
-def _texts(config: type[Any]) -> dict[str, str]:
-    """Return the docstring below each field of a dataclass, and of its bases."""
-    import ast
-    import inspect
-    import textwrap
-
-    texts: dict[str, str] = {}
-    for cls in reversed(config.__mro__):
-        try:
-            tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-        except (OSError, SyntaxError, TypeError):
-            continue
-        body = tree.body[0].body if tree.body and isinstance(tree.body[0], ast.ClassDef) else []
-        for before, after in pairwise(body):
-            if (
-                isinstance(before, ast.AnnAssign)
-                and isinstance(before.target, ast.Name)
-                and isinstance(after, ast.Expr)
-                and isinstance(after.value, ast.Constant)
-                and isinstance(after.value.value, str)
-            ):
-                texts[before.target.id] = " ".join(after.value.value.split())
-    return texts
 
 
 def _toml(value: Any) -> str:

@@ -45,7 +45,8 @@ class Import:
     sources: Annotated[Positional[tuple[str, ...]], shown("FILE...")]
     """Files of recordings, in their order; - reads standard input (with --format)."""
     output: Annotated[str, arg(metavar="FILE", aliases=["-o"])]
-    """File of demonstrations to write, such as reach.safetensors; - writes standard output."""
+    """File of demonstrations to write, such as reach.safetensors, over one that is there already; -
+    writes standard output."""
     format: Annotated[str | None, shown("FORMAT")] = None
     """Format of the sources, where names do not tell: csv, npz, jsonl, mat, rosbag, minari."""
     plot: Annotated[str | None, shown("PICTURE")] = None
@@ -78,7 +79,13 @@ class Import:
             raise UsageError("Expected one thing for standard output, got several.")
         if self.sources.count(PIPE) > 1:
             raise UsageError("Expected standard input (-) once among the sources, got it again.")
-        check_output(self.output, *self.sources)
+        again = [s for i, s in enumerate(self.sources) if s in self.sources[:i] and s != PIPE]
+        if again:
+            raise UsageError(
+                f"Expected each file of recordings once, got {again[0]} again: every demonstration "
+                "counts as one."
+            )
+        check_output(self.output, *self.sources, suffix=".safetensors")
         if self.plot is not None:
             check_picture(self.plot)
         sources = [
@@ -102,10 +109,11 @@ class Import:
 
             save_picture(cleaning_figure(cleaned), self.plot)
         demos = cleaned.demonstrations
+        s = "" if len(demos) > 1 else "s"
         ends = (
-            f"ends at {' '.join(f'{g:.4g}' for g in demos.goal)} {demos.length_unit}"
+            f"end{s} at {' '.join(f'{g:.4g}' for g in demos.goal)} {demos.length_unit}"
             if demos.goal is not None
-            else f"repeats every {demos.period:.4g} s"
+            else f"repeat{s} every {demos.period:.4g} s"
         )
         counts = sorted({len(p) for p in demos.positions})
         samples = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
@@ -113,6 +121,8 @@ class Import:
             f"{demos.name}: {len(demos)} demonstration{'s' * (len(demos) > 1)} of {samples} "
             f"samples in {demos.n_dims} dimensions, which {ends}. Written to {_named(self.output)}."
         )
+        if len(demos) == 1:
+            say("One recording alone: nothing shows its spread, and none is left to score unseen.")
         if self.json:
             print_json(
                 {

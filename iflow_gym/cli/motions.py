@@ -35,9 +35,11 @@ def environment_id(name: str) -> str | None:
 def load_motion(name: str) -> tuple[Demonstrations, str | None]:
     """Return the demonstrations of a file, of ``-``, or of an environment, and that one's id."""
     from iflow_gym.demonstration_files import (
+        DemonstrationFileError,
         demonstrations_from_bytes,
         load_demonstrations,
     )
+    from iflow_gym.recordings.reading import SUFFIXES
 
     if name == PIPE:
         return demonstrations_from_bytes(input_bytes(), "standard input").demonstrations, None
@@ -49,7 +51,15 @@ def load_motion(name: str) -> tuple[Demonstrations, str | None]:
 
         env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
         return env.demonstrations, env_id  # type: ignore[attr-defined]
-    return load_demonstrations(name), None
+    try:
+        return load_demonstrations(name), None
+    except DemonstrationFileError as error:
+        if Path(name).suffix.lower() in SUFFIXES:
+            raise ValueError(
+                f"Expected demonstrations, which `iflow-gym import` wrote, got {name}, a recording "
+                f"by its name. First: iflow-gym import {name} -o {Path(name).stem}.safetensors"
+            ) from error
+        raise
 
 
 def _unknown(name: str) -> str:
@@ -94,3 +104,21 @@ def load_model_file(path: str, method: str | None) -> tuple[Method, dict[str, ob
         )
     with input_path(path) as file:
         return load_model(file, method=method), inspect_model(file).fit
+
+
+def check_match(
+    method: Method, record: dict[str, object] | None, demonstrations: Demonstrations
+) -> None:
+    """Raise UsageError for a model and a motion of different dimension or unit of length."""
+    if method.n_dims_ != demonstrations.n_dims:
+        raise UsageError(
+            f"Expected a model and a motion of the same dimension, got {method.n_dims_} and "
+            f"{demonstrations.n_dims}."
+        )
+    unit = (record or {}).get("length_unit")
+    if isinstance(unit, str) and unit != demonstrations.length_unit:
+        raise UsageError(
+            f"Expected a model and a motion of the same unit of length, got a model in {unit} and "
+            f"a motion in {demonstrations.length_unit}: import the recordings in the model's unit "
+            f"(iflow-gym import --to-unit {unit})."
+        )

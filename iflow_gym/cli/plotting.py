@@ -60,7 +60,7 @@ class Plot:
 
     def run(self) -> int:
         """Draw."""
-        from iflow_gym.cli.motions import load_model_file, load_motion
+        from iflow_gym.cli.motions import check_match, load_model_file, load_motion
 
         only_one_pipe(self.motion, self.model or "")
         check_picture(self.output)
@@ -73,12 +73,8 @@ class Plot:
         demos, _ = load_motion(self.motion)
         method = None
         if self.model is not None:
-            method, _ = load_model_file(self.model, self.method)
-            if method.n_dims_ != demos.n_dims:
-                raise UsageError(
-                    f"Expected a model and a motion of the same dimension, got {method.n_dims_} "
-                    f"and {demos.n_dims}."
-                )
+            method, record = load_model_file(self.model, self.method)
+            check_match(method, record, demos)
         elif self.grid:
             raise UsageError("Expected a model to roll out from a grid (--model), got none.")
         if self.grid and demos.n_dims != 2:

@@ -53,7 +53,7 @@ class Rollout:
     dt: Annotated[float | None, shown("SECONDS")] = None
     """Seconds a step; by default the mean of the demonstrations'."""
     duration: Annotated[float | None, shown("SECONDS")] = None
-    """Seconds of a rollout; by default the longest demonstration, or two rounds, of --motion."""
+    """Seconds of a rollout; by default the longest demonstration, or two rounds."""
     push: Annotated[tuple[str, ...], UseAppendAction, shown("T:DX,DY")] = ()
     """A displacement at a time in seconds, t:dx,dy[,dz]; may be given several times."""
     method: Annotated[str | None, shown("MODULE:CLASS")] = None
@@ -65,11 +65,12 @@ class Rollout:
         """Roll out."""
         import numpy as np
 
-        from iflow_gym.cli.motions import load_model_file, load_motion
+        from iflow_gym.cli.motions import check_match, load_model_file, load_motion
 
         only_one_pipe(self.model, self.starts or "", self.motion or "")
         if self.output != PIPE:
-            check_output(self.output, self.model, self.starts or "", self.motion or "")
+            inputs = (self.model, self.starts or "", self.motion or "")
+            check_output(self.output, *inputs, suffix=".csv")
         method, record = load_model_file(self.model, self.method)
         d = method.n_dims_
         starts = [_vector(text, d, "--start") for text in self.start]
@@ -78,11 +79,7 @@ class Rollout:
         dt, duration = self.dt, self.duration
         if self.motion is not None:
             demos, _ = load_motion(self.motion)
-            if demos.n_dims != d:
-                raise UsageError(
-                    f"Expected a model and a motion of the same dimension, got {d} and "
-                    f"{demos.n_dims}."
-                )
+            check_match(method, record, demos)
             starts += [] if starts else list(demos.starts)
             dt = demos.mean_dt if dt is None else dt
             if duration is None:
@@ -93,17 +90,17 @@ class Rollout:
             raise UsageError(
                 "Expected starts (--start 0.3,0.1, --starts file.csv, or --motion), got none."
             )
-        said = (record or {}).get("mean_dt")
-        if dt is None and isinstance(said, float):
-            dt = said
+        dt = _said(record, "mean_dt") if dt is None else dt
         if dt is None or not (np.isfinite(dt) and dt > 0):
-            raise UsageError(f"Expected a time step > 0 in seconds (--dt), got {dt}.")
-        if duration is None and method.period_ is not None:
-            duration = 2 * method.period_
+            came = "none" if dt is None else dt
+            raise UsageError(f"Expected a time step > 0 in seconds (--dt), got {came}.")
+        if duration is None:
+            period = method.period_
+            duration = _said(record, "longest") if period is None else 2 * period
         if duration is None or not (np.isfinite(duration) and duration >= dt):
             raise UsageError(
                 f"Expected a duration of at least one step of {dt:g} s (--duration, or --motion "
-                f"for that of the demonstrations), got {duration}."
+                f"for that of the demonstrations), got {'none' if duration is None else duration}."
             )
         pushes = sorted((_push(text, d) for text in self.push), key=lambda p: p[0])
         n_steps = round(duration / dt)
@@ -122,7 +119,10 @@ class Rollout:
         if self.output == PIPE:
             _write(sys.stdout, heading, times, paths, velocities)
             return 0
-        with output_path(self.output) as path, path.open("w", newline="", encoding="utf-8") as file:
+        with (
+            output_path(self.output, ".csv") as path,
+            path.open("w", newline="", encoding="utf-8") as file,
+        ):
             _write(file, heading, times, paths, velocities)
         say(f"{len(starts)} rollouts of {n_steps} steps of {dt:g} s. Written to {self.output}.")
         return 0
@@ -180,6 +180,12 @@ def _write(
     for i, (path, speeds) in enumerate(zip(paths.tolist(), velocities.tolist(), strict=True)):
         for t, x, v in zip(times.tolist(), path, speeds, strict=True):
             writer.writerow([i, f"{t:.9g}", *(f"{c:.9g}" for c in (*x, *v))])
+
+
+def _said(record: dict[str, Any] | None, key: str) -> float | None:
+    """Return the seconds that a model file says of what it was fitted on, if it does."""
+    value = (record or {}).get(key)
+    return value if isinstance(value, float) else None
 
 
 def _vector(text: str, d: int, flag: str) -> FloatArray:

@@ -59,18 +59,14 @@ class Score:
         """Score."""
         import gymnasium
 
-        from iflow_gym.cli.motions import OWN, load_model_file, load_motion
+        from iflow_gym.cli.motions import OWN, check_match, load_model_file, load_motion
         from iflow_gym.evaluate import evaluate, motion_of
 
         only_one_pipe(self.model, self.motion)
         check_seed(self.seed)
         method, record = load_model_file(self.model, self.method)
         demonstrations, env_id = load_motion(self.motion)
-        if method.n_dims_ != demonstrations.n_dims:
-            raise UsageError(
-                f"Expected a model and a motion of the same dimension, got {method.n_dims_} and "
-                f"{demonstrations.n_dims}."
-            )
+        check_match(method, record, demonstrations)
         if (method.period_ is None) != (demonstrations.period is None):
             kinds = [
                 "ends" if p is None else "repeats" for p in (method.period_, demonstrations.period)

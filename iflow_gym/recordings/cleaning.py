@@ -32,6 +32,9 @@ class CleanUp:
     to_unit: Annotated[str | None, shown("UNIT")] = None
     """Unit of the demonstrations; by default the same. Another one than --unit scales: both are
     among m, dm, cm, mm, um, km, in."""
+    split: Annotated[float | None, shown("SECONDS")] = None
+    """Cut recordings at gaps in time longer than this: several demonstrations in a file. Shorter
+    gaps are bridged; without it, gaps that hide a piece of the motion are refused."""
     bad_times: BadTimes = "error"
     """Samples whose time repeats or goes back: "error" or "drop"."""
     missing: Missing = "drop"
@@ -123,7 +126,14 @@ def clean(
     if factor != 1.0:
         text = f"scaled by {factor:g}, from {came_in} to {unit}"
         notes.append(Note("units", "", text, {"factor": factor}))
-    done = [_cleaned(r, chosen, notes) for r in before]
+    if chosen.split is not None:
+        before = _split(before, chosen.split, notes)
+    done = [_cleaned(r, chosen, unit, notes) for r in before]
+    if chosen.hold_out and not 0 <= chosen.hold_out < len(done):
+        raise RecordingError(
+            f"Expected to hold out from 0 to {len(done) - 1} recordings, one less than there are, "
+            f"got {chosen.hold_out} (--hold-out)."
+        )
     if len({r.n_dims for r in done}) > 1:
         dims = sorted({r.n_dims for r in done})
         raise RecordingError(
@@ -159,9 +169,9 @@ def clean(
                 notes.append(note)
     else:
         goal = _goal(chosen, done[0].n_dims)
-        done, moved = steps.aligned(done, chosen.align, goal)
+        done, moved = steps.aligned(done, chosen.align, goal, unit)
         notes += moved
-        _check_ends(done, goal, chosen)
+        _check_ends(done, goal, chosen, unit)
     try:
         demonstrations = _demonstrations(done, chosen, unit, period, source)
     except (TypeError, ValueError) as error:
@@ -169,7 +179,21 @@ def clean(
     return Cleaned(demonstrations, tuple(notes), before, tuple(done))
 
 
-def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> RawRecording:
+def _split(
+    recordings: Sequence[RawRecording], seconds: float, notes: list[Note]
+) -> tuple[RawRecording, ...]:
+    """Return the pieces of all recordings, times from 0, and append what was split."""
+    done: list[RawRecording] = []
+    for recording in recordings:
+        pieces, note = steps.split_at_gaps(recording, seconds)
+        done += [steps.scaled(p) for p in pieces]
+        notes += [note] if note is not None else []
+    return tuple(done)
+
+
+def _cleaned(
+    recording: RawRecording, chosen: CleanUp, unit: str, notes: list[Note]
+) -> RawRecording:
     """Return what concerns one recording alone done to it, and append what was done."""
 
     def noted(done: tuple[RawRecording, Note | None]) -> RawRecording:
@@ -178,6 +202,8 @@ def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> Raw
         return done[0]
 
     recording = noted(steps.in_order(recording, chosen.bad_times))
+    if chosen.split is None:
+        steps.check_gaps(recording)
     recording = noted(steps.without_gaps(recording, chosen.missing))
     if len(recording) < LEAST_SAMPLES:
         raise RecordingError(
@@ -206,7 +232,7 @@ def _cleaned(recording: RawRecording, chosen: CleanUp, notes: list[Note]) -> Raw
                 f"{note.values['longest_step_seconds']:.3g} s apart: resample them (leave out "
                 "--no-resample)."
             )
-    return noted(steps.smoothed(recording, chosen.smooth, rough))
+    return noted(steps.smoothed(recording, chosen.smooth, rough, unit))
 
 
 def _scale(unit: str, to_unit: str | None) -> tuple[float, str]:
@@ -236,6 +262,7 @@ def _check_ends(
     done: Sequence[RawRecording],
     goal: np.ndarray[Any, np.dtype[np.float64]] | None,
     chosen: CleanUp,
+    unit: str,
 ) -> None:
     ends = np.stack([r.positions[-1] for r in done])
     target = ends.mean(axis=0) if goal is None else goal
@@ -247,10 +274,10 @@ def _check_ends(
     away = np.linalg.norm(ends - target, axis=1)
     if away.max() > allowed:
         raise RecordingError(
-            f"Expected the recordings to end within {allowed:.3g} of one goal, "
+            f"Expected the recordings to end within {allowed:.3g} {unit} of one goal, "
             f"{np.array2string(target, precision=4)}, got {done[int(away.argmax())].name}, which "
-            f"ends {away.max():.3g} away: make them end there (--align shift moves them, --align "
-            "bend keeps their starts), give the goal (--goal), or accept the spread "
+            f"ends {away.max():.3g} {unit} away: make them end there (--align shift moves them, "
+            "--align bend keeps their starts), give the goal (--goal), or accept the spread "
             "(--goal-tolerance). Of a motion that repeats say --kind cycle."
         )
 

@@ -18,6 +18,9 @@ from iflow_gym.demonstrations import FloatArray
 from iflow_gym.recordings.raw import RawRecording, RecordingError
 from iflow_gym.recordings.steps import Note, scaled
 
+SLOW = 1.0
+"""Seconds between samples from which a unit that nothing says is doubted."""
+
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 """Seconds in units of time."""
 
@@ -110,8 +113,10 @@ class Reading:
         return Reading(recordings, [*self.notes, *other.notes], self.unit or other.unit)
 
 
-def from_table(table: Mapping[str, Column], columns: Columns, name: str) -> Reading:
-    """Make recordings of named columns of one length.
+def from_table(
+    table: Mapping[str, Column], columns: Columns, name: str, lines: Sequence[int] | None = None
+) -> Reading:
+    """Make recordings of named columns of one length; the samples' lines in a text are for errors.
 
     Raises
     ------
@@ -152,27 +157,32 @@ def from_table(table: Mapping[str, Column], columns: Columns, name: str) -> Read
     dropped_speeds: tuple[str, ...] = ()
     if columns.velocities is None and speeds and len(speeds) != len(positions):
         dropped_speeds, speeds = speeds, ()
-    points = _numbers(table, positions, name)
-    moving = _numbers(table, speeds, name) if speeds else None
+    points = _numbers(table, positions, name, lines)
+    moving = _numbers(table, speeds, name, lines) if speeds else None
     if moving is not None and moving.shape != points.shape:
         raise RecordingError(
             f"Expected a velocity for each of the positions {', '.join(positions)} of {name}, got "
             f"{', '.join(speeds)}."
         )
     said = plain[time][1] if time is not None else None
-    unit = columns.time_unit or (said if said in SECONDS and said is not None else "s")
-    stamps = None if time is None else _numbers(table, (time,), name)[:, 0]
+    told = columns.time_unit or (said if said in SECONDS else None)
+    unit = told or "s"
+    stamps = None if time is None else _numbers(table, (time,), name, lines)[:, 0]
+    headless = names == [str(i) for i in range(len(names))]
     recordings = []
-    for label, rows in _groups(table, group, name):
-        own = f"{name}, {group} {label}" if group is not None else name
+    for label, rows in _groups(table, group, name, lines):
+        word = "recording" if headless and group is not None else group
+        own = f"{name}, {word} {label}" if group is not None else name
         chosen = points[rows]
-        times = _times(stamps[rows] if stamps is not None else None, len(chosen), columns, own)
+        part = stamps[rows] if stamps is not None else None
+        times = _times(part, len(chosen), columns, own, names)
         recording = RawRecording(own, times, chosen, None if moving is None else moving[rows])
         recordings.append(
             _in_seconds(recording, SECONDS[unit]) if stamps is not None else recording
         )
     left_out = [n for n in names if n not in {time, group, *positions, *speeds}]
     text = _said(time, unit, columns.dt, positions, speeds, group, left_out)
+    text += _doubt(told, recordings) if stamps is not None else ""
     if dropped_speeds:
         text += f" ({', '.join(dropped_speeds)}: no velocity for each coordinate)"
     values = {
@@ -321,7 +331,8 @@ def _stack(
             own = label if n == 1 else f"{label}[{i}]"
             own = f"{own}, {group_key} {word}" if group_key else own
             chosen = stacked[i][rows]
-            times = _times(None if stamps is None else stamps[i][rows], len(chosen), columns, own)
+            part = None if stamps is None else stamps[i][rows]
+            times = _times(part, len(chosen), columns, own, list(arrays))
             recording = RawRecording(
                 own, times, chosen, None if speeds is None else speeds[i][rows]
             )
@@ -337,6 +348,7 @@ def _stack(
         group_key,
         [],
     )
+    text += _doubt(columns.time_unit, recordings) if stamps is not None else ""
     if turn:
         text += "; turned, because it has more columns than rows"
     values = {
@@ -426,15 +438,32 @@ def _known(column: str, names: Sequence[str], where: str) -> str:
     return column
 
 
-def _numbers(table: Mapping[str, Column], names: Sequence[str], where: str) -> FloatArray:
+def _doubt(unit: str | None, recordings: Sequence[RawRecording]) -> str:
+    """Return a word on times that are taken for seconds and hardly are."""
+    apart = [float(np.median(np.abs(np.diff(r.times)))) for r in recordings if len(r) > 1]
+    if unit is not None or not apart or min(apart) < SLOW:
+        return ""
+    return (
+        f"; its samples are {min(apart):.3g} s apart then: if they are milliseconds, say so "
+        "(--time-unit ms)"
+    )
+
+
+def _numbers(
+    table: Mapping[str, Column], names: Sequence[str], where: str, lines: Sequence[int] | None
+) -> FloatArray:
     for column in names:
         if table[column].dtype.kind != "f":
             row, cell = _first_word(table[column])
             raise RecordingError(
-                f"Expected numbers in column {column!r} of {where}, got {cell!r} in row {row + 1}: "
-                "mend the cell, or name other columns (--positions, --time)."
+                f"Expected numbers in column {column!r} of {where}, got {cell!r} in "
+                f"{_place(row, lines)}: mend the cell, or name other columns (--positions, --time)."
             )
     return np.stack([np.asarray(table[c], dtype=np.float64) for c in names], axis=1)
+
+
+def _place(row: int, lines: Sequence[int] | None) -> str:
+    return f"sample {row + 1}" if lines is None else f"line {lines[row]}"
 
 
 def _first_word(column: Column) -> tuple[int, str]:
@@ -447,7 +476,10 @@ def _first_word(column: Column) -> tuple[int, str]:
 
 
 def _groups(
-    table: Mapping[str, Column], group: str | None, name: str
+    table: Mapping[str, Column],
+    group: str | None,
+    name: str,
+    lines: Sequence[int] | None = None,
 ) -> list[tuple[str, np.ndarray[Any, np.dtype[np.bool_]]]]:
     """Return the rows of each recording, in the order in which they come."""
     if group is None:
@@ -457,8 +489,8 @@ def _groups(
     if labels.dtype.kind == "f" and not np.isfinite(labels).all():
         row = int(np.argmin(np.isfinite(labels)))
         raise RecordingError(
-            f"Expected a value in column {group!r} of {name} for every sample, got none in row "
-            f"{row + 1}."
+            f"Expected a value in column {group!r} of {name} for every sample, got none in "
+            f"{_place(row, lines)}."
         )
     values, first = np.unique(labels, return_index=True)
     if len(values) > 10_000:
@@ -473,13 +505,16 @@ def _groups(
     ]
 
 
-def _times(stamps: FloatArray | None, n: int, columns: Columns, name: str) -> FloatArray:
+def _times(
+    stamps: FloatArray | None, n: int, columns: Columns, name: str, came: Sequence[str]
+) -> FloatArray:
     if stamps is not None:
         return stamps
     if columns.dt is None:
         raise RecordingError(
-            f"Expected time stamps in {name}, in a column such as t or time, got none: name their "
-            "column (--time), or give the seconds a sample (--dt)."
+            f"Expected time stamps in {name}, in a column such as t or time, got "
+            f"{', '.join(came[:20])}: name their column (--time), or give the seconds a sample "
+            "(--dt)."
         )
     return np.asarray(np.arange(n) * columns.dt, dtype=np.float64)
 

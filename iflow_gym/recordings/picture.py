@@ -27,9 +27,10 @@ def cleaning_figure(cleaned: Cleaned) -> Figure:
     Motions that are not planar are drawn as coordinates over time in place of paths.
     """
     demos = cleaned.demonstrations
-    figure = Figure(figsize=(9.0, 6.6), layout="constrained", facecolor="white")
+    high = _height(cleaned)
+    figure = Figure(figsize=(9.0, high + 2.64), layout="constrained", facecolor="white")
     before, after, speed_before, speed_after = figure.subplots(
-        2, 2, gridspec_kw={"height_ratios": (3, 2)}
+        2, 2, gridspec_kw={"height_ratios": (high, 2.64)}
     ).ravel()
     n = sum(len(r) for r in cleaned.before)
     m = sum(len(r) for r in cleaned.after)
@@ -42,13 +43,11 @@ def cleaning_figure(cleaned: Cleaned) -> Figure:
     if demos.n_dims == 2:
         if demos.goal is not None:
             after.plot(*demos.goal, "*", color=GOAL, markersize=14, markeredgecolor=INK, zorder=7)
-        limits = [np.concatenate([r.positions for r in (*cleaned.before, *cleaned.after)])]
-        low, high = np.nanmin(limits[0], axis=0), np.nanmax(limits[0], axis=0)
-        margin = 0.06 * float((high - low).max())
+        low, top = _box(cleaned)
         for ax in (before, after):
             ax.set_aspect("equal")
-            ax.set_xlim(low[0] - margin, high[0] + margin)
-            ax.set_ylim(low[1] - margin, high[1] + margin)
+            ax.set_xlim(low[0], top[0])
+            ax.set_ylim(low[1], top[1])
     for raw in cleaned.before:
         times, speed = _raw_speed(raw)
         speed_before.plot(times, speed, color=RAW, linewidth=0.9)
@@ -74,6 +73,23 @@ def cleaning_figure(cleaned: Cleaned) -> Figure:
         for spine in ax.spines.values():
             spine.set_color("#c9c5bb")
     return figure
+
+
+def _box(cleaned: Cleaned) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and the upper corner of what is drawn, with a margin."""
+    points = np.concatenate([r.positions for r in (*cleaned.before, *cleaned.after)])
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    margin = 0.06 * float((high - low).max())
+    return low - margin, high + margin
+
+
+def _height(cleaned: Cleaned) -> float:
+    """Return the inches of the upper row: less for a flat motion, which would leave it white."""
+    if cleaned.demonstrations.n_dims != 2:
+        return 3.96
+    low, high = _box(cleaned)
+    width, height = high - low
+    return float(np.clip(0.8 + 3.9 * height / max(width, 1e-300), 1.6, 3.96))
 
 
 def _paths(

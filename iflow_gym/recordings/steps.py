@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -35,7 +36,21 @@ SCATTER = 5e-4
 """Samples that scatter by more than this fraction of the diagonal are smoothed by themselves."""
 
 SHARE = 0.07
-"""Window of that smoothing, as a fraction of the recording's duration."""
+"""Window of that smoothing, as a fraction of the recording's duration, at most."""
+
+MOVES = 1.5
+"""It is narrowed until it moves samples by no more than so many times their scatter: what it moves
+beyond that is the motion. A recording of many rounds is cut off at its corners otherwise."""
+
+MOST_CUT = 0.25
+"""What leads over more than this fraction of the diagonal is a motion, however slow it is."""
+
+GAP_SAMPLES = 30
+"""A sensor loses a few samples in a row; a gap of more sample times than these is looked at."""
+
+GAP_SHARE = 0.1
+"""A gap of more than this fraction of the longest stretch without one hides a piece of the motion
+that a cubic cannot know: from a tenth of a motion on, samples of a whole turn may be lost."""
 
 ORDER = 3
 """Of the polynomials of Savitzky and Golay."""
@@ -83,18 +98,86 @@ def in_order(
     )
     if bad_times == "error":
         raise RecordingError(
-            f"Expected increasing times in {recording.name}, got {counts} time stamps of "
-            f"{len(recording)}, the first at sample {at}: {recording.times[at]:g} s after "
+            f"Expected increasing times in {recording.name}, got {counts} among {len(recording)} "
+            f"time stamps, the first at sample {at}: {recording.times[at]:g} s after "
             f"{before[at]:g} s. Look whether two recordings are in one column (name the column "
-            "that tells them apart), or drop these samples (bad_times='drop', --bad-times drop)."
+            "that tells them apart), or drop these samples (--bad-times drop)."
         )
     note = Note(
         "times",
         recording.name,
-        f"dropped {bad.sum()} samples of {len(recording)} with {counts} time stamps",
+        f"dropped {bad.sum()} of {len(recording)} samples by their times: {counts}",
         {"repeated": repeated, "backward": backward},
     )
     return recording.take(~bad), note
+
+
+def split_at_gaps(
+    recording: RawRecording, seconds: float
+) -> tuple[list[RawRecording], Note | None]:
+    """Return the pieces between gaps in time that are longer than so many seconds."""
+    if not seconds > 0:
+        raise RecordingError(f"Expected gaps > 0 in seconds to split at (--split), got {seconds}.")
+    rows = np.flatnonzero(recording.whole)
+    gaps = _gaps(recording)
+    wide = gaps > seconds
+    if not wide.any():
+        return [recording], None
+    edges = [0, *(rows[1:][wide]), len(recording)]
+    pieces = [
+        replace(recording.take(slice(begin, end)), name=f"{recording.name}, part {i}")
+        for i, (begin, end) in enumerate(pairwise(edges), start=1)
+    ]
+    count, least, most = int(wide.sum()), float(gaps[wide].min()), float(gaps[wide].max())
+    long = (
+        f"a gap of {most:.3g} s" if count == 1 else f"{count} gaps of {least:.3g} to {most:.3g} s"
+    )
+    values = {"recordings": len(pieces), "least_gap_seconds": least, "longest_gap_seconds": most}
+    return pieces, Note("split", recording.name, f"split in {len(pieces)} at {long}", values)
+
+
+def check_gaps(recording: RawRecording) -> None:
+    """Raise RecordingError for a gap in time out of all proportion, across which something moved.
+
+    That is one of more than `GAP_SAMPLES` sample times (the median) and `GAP_SHARE` of the longest
+    stretch without one. Where nothing moved across it, a recorder that writes changes only was
+    waiting. Call `in_order` first.
+    """
+    kept = recording.take(recording.whole)
+    gaps = _gaps(recording)
+    if len(gaps) < LEAST_SAMPLES:
+        return
+    usual = float(np.median(gaps))
+    wide = np.flatnonzero(gaps > GAP_SAMPLES * usual)
+    ends = kept.times[np.concatenate([wide, [len(kept) - 1]])]
+    stretch = float((ends - kept.times[np.concatenate([[0], wide + 1])]).max())
+    way = np.linalg.norm(kept.positions[wide + 1] - kept.positions[wide], axis=1)
+    wide = wide[(gaps[wide] > GAP_SHARE * stretch) & (way > LEAST_WAY * recording.diagonal)]
+    if not len(wide):
+        return
+    at = wide[int(np.argmax(gaps[wide]))]
+    several = f"{len(wide)} gaps, the longest" if len(wide) > 1 else "a gap"
+    begin, end = kept.times[at], kept.times[at + 1]
+    raise RecordingError(
+        f"Expected samples of one motion in {recording.name}, some {usual:.3g} s apart, got "
+        f"{several} of {gaps[at]:.3g} s, from {begin:.5g} to {end:.5g} s, in which the position "
+        "changed: what happened there nobody knows. If these are several recordings, split them "
+        f"there (--split {_one_digit(gaps[wide].min() / 2):g}) or name the column that tells them "
+        "apart (--group); to bridge gaps, split at longer ones only "
+        f"(--split {_one_digit(gaps[at], 1):g})."
+    )
+
+
+def _gaps(recording: RawRecording) -> FloatArray:
+    """Return the seconds from the latest whole sample so far to each that follows."""
+    times = recording.times[recording.whole]
+    return np.asarray(times[1:] - np.maximum.accumulate(times)[:-1])
+
+
+def _one_digit(value: float, more: int = 0) -> float:
+    """Return a value cut to its first digit, or so much more in that digit."""
+    digit = 10 ** np.floor(np.log10(value))
+    return float((np.floor(value / digit) + more) * digit)
 
 
 def without_gaps(
@@ -192,6 +275,15 @@ def trimmed(recording: RawRecording, still: float = STILL) -> tuple[RawRecording
     if start + end == 0 or inside.sum() < LEAST_SAMPLES:
         return recording, None
     kept = recording.take(slice(start, n - end))
+    cut = [recording.take(slice(0, start + 1)), recording.take(slice(n - end - 1, n))]
+    share = max(r.diagonal for r in cut) / recording.diagonal
+    if share > MOST_CUT:
+        raise RecordingError(
+            f"Expected still stretches to cut off {recording.name}, got {start + end} of {n} "
+            f"samples below {still:g} of the fast speed, which lead over {share:.0%} of its "
+            "diagonal: count less as still (--still 0.03 by default), or cut nothing off "
+            "(--no-trim)."
+        )
     times = recording.times
     seconds = (float(times[start] - times[0]), float(times[-1] - times[n - 1 - end]))
     parts = [
@@ -282,7 +374,10 @@ def scatter(recording: RawRecording) -> float:
 
 
 def smoothed(
-    recording: RawRecording, window: float | None = None, roughness: float | None = None
+    recording: RawRecording,
+    window: float | None = None,
+    roughness: float | None = None,
+    unit: str = "",
 ) -> tuple[RawRecording, Note | None]:
     """Return the recording with positions and velocities of cubics fitted to a moving window.
 
@@ -294,10 +389,13 @@ def smoothed(
     recording : RawRecording
         Evenly sampled.
     window : float, optional
-        Seconds; 0 smooths nothing. By default `SHARE` of the duration, and nothing for samples that
-        scatter by less than `SCATTER` of the diagonal.
+        Seconds; 0 smooths nothing. By default `SHARE` of the duration, less where that would move
+        samples by more than `MOVES` times their scatter, and nothing for samples that scatter by
+        less than `SCATTER` of the diagonal.
     roughness : float, optional
         What `scatter` says of the recording before it was resampled; by default of this one.
+    unit : str
+        Of length, for the note.
 
     Notes
     -----
@@ -314,6 +412,12 @@ def smoothed(
             return recording, None
         samples = _odd(max(SHARE * n, 7))
         samples = samples if samples <= n else _odd(n - 1, down=True)
+        while samples > ORDER + 2:
+            straight = savgol_filter(recording.positions, samples, ORDER, axis=0)
+            off = np.linalg.norm(straight - recording.positions, axis=1)
+            if np.sqrt(np.mean(off**2)) <= MOVES * rough:
+                break
+            samples = _odd(0.8 * samples, down=True)
     elif not (np.isfinite(window) and window >= 0):
         raise RecordingError(f"Expected a smoothing window >= 0 in seconds, got {window}.")
     elif window == 0:
@@ -342,9 +446,10 @@ def smoothed(
         speeds = filtered(recording.velocities)
     moved = np.linalg.norm(positions - recording.positions, axis=1)
     rms, most = float(np.sqrt(np.mean(moved**2))), float(moved.max())
+    own = unit and f" {unit}"
     text = (
         f"smoothed by cubics over {samples * step:.3g} s ({samples} samples), which moved samples "
-        f"by {rms:.3g} RMS and {most:.3g} at most; they scattered by {rough:.3g}"
+        f"by {rms:.3g}{own} RMS and {most:.3g}{own} at most; they scattered by {rough:.3g}{own}"
     )
     values = {
         "window_seconds": samples * step,
@@ -377,7 +482,7 @@ def scaled(
 
 
 def aligned(
-    recordings: Sequence[RawRecording], how: Align, goal: FloatArray | None = None
+    recordings: Sequence[RawRecording], how: Align, goal: FloatArray | None = None, unit: str = ""
 ) -> tuple[list[RawRecording], list[Note]]:
     """Return recordings that all end at one goal.
 
@@ -389,6 +494,8 @@ def aligned(
         start, in proportion to the way covered; ``"none"`` nothing.
     goal : array, shape (d,), optional
         By default the mean of the ends.
+    unit : str
+        Of length, for the notes.
     """
     if how == "none":
         return list(recordings), []
@@ -413,7 +520,7 @@ def aligned(
         positions[-1] = target
         done.append(replace(recording, positions=positions, velocities=speeds))
         word = "shifted" if how == "shift" else "bent"
-        text = f"{word} by {far:.4g} to end at the goal"
+        text = f"{word} by {far:.4g}{unit and f' {unit}'} to end at the goal"
         notes.append(Note("align", recording.name, text, {"how": how, "distance": far}))
     return done, notes
 

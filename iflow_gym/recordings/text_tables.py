@@ -62,14 +62,16 @@ def read(source: Source, columns: Columns) -> Reading:
             f"Expected different headings in {source.name}, got {', '.join(twice)} more than once."
         )
     if not headed and columns.positions is None:
+        grouped = ", or --group 0 --time 1 --positions 2 3 where column 0 tells recordings apart"
+        grouped = grouped if width > 3 else ""
         raise RecordingError(
             f"Expected a heading in {source.name}, such as t,x,y, got numbers in the first line: "
             f"name the columns by their numbers, 0 to {width - 1} (for instance --time 0 "
-            "--positions 1 2)."
+            f"--positions 1 2{grouped})."
         )
     body = rows[1:] if headed else rows
     table = {name: _column([row[i] for row in body]) for i, name in enumerate(heading)}
-    return from_table(table, columns, source.name)
+    return from_table(table, columns, source.name, lines[-len(body) :])
 
 
 def _rows(text: str, delimiter: str | None, name: str) -> tuple[list[list[str]], list[int]]:

@@ -52,6 +52,7 @@ def folder(tmp_path_factory):
         method = "linear" if name == "part" else name
         arguments = [f"{path}/angle.safetensors", "-o", f"{path}/{name}.safetensors"]
         assert run(["fit", *arguments, "--method", method, *more]) == 0
+    load_model(path / "linear.safetensors").save(path / "bare.safetensors")
     return path
 
 
@@ -83,6 +84,36 @@ def test_every_command_has_help(call, name):
     assert "None" not in output
     if name:
         assert len(re.findall(rf"^    .*iflow-gym {name}", output, flags=re.M)) >= 1
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("import", "Another one than --unit scales: both are among m, dm, cm"),
+        ("fit", "or the first four sevenths, so that `score` can take the rest"),
+        ("data export-minari", "Write demonstrations as Minari datasets, such as"),
+        ("leaderboard run", "Seeds; the preset's by default. Methods without"),
+        ("leaderboard check", "Check a submission: method.toml, records"),
+    ],
+)
+def test_helps_texts_are_there_once_and_wrapped_as_paragraphs(call, monkeypatch, line, text):
+    monkeypatch.setenv("COLUMNS", "400")
+    status, output, _ = call(*line.split(), "--help")
+    assert (status, sum(text in one for one in output.splitlines())) == (0, 1)
+    assert "(default: )" not in output
+
+
+def test_a_group_lists_its_commands(call):
+    status, output, _ = call("data", "--help")
+    assert (status, "export-minari" in output, "iflow-gym data fetch" in output) == (0, True, True)
+    assert call("data")[0] == 2
+    assert call("data", "wher")[0] == 2
+
+
+def test_the_version_is_the_packages(call):
+    from importlib.metadata import version
+
+    assert call("--version") == (0, f"iflow-gym {version('iflow-gym')}\n", "")
 
 
 def test_help_imports_nothing_heavy():
@@ -143,15 +174,24 @@ def test_completion_knows_the_commands(call):
         (["data", "where", "nothing"], "nothing"),
         (["rollout", "linear.safetensors"], "--start"),
         (["rollout", "linear.safetensors", "--start", "1"], "2 numbers"),
-        (["rollout", "linear.safetensors", "--start", "1,2"], "--duration"),
+        (["rollout", "bare.safetensors", "--start", "1,2"], "(--dt), got none"),
+        (
+            ["rollout", "bare.safetensors", "--start", "1,2", "--dt", "1"],
+            "demonstrations), got none",
+        ),
         (["rollout", "linear.safetensors", "--motion", "angle.safetensors", "--push", "1"], "t:dx"),
         (["plot", "angle.safetensors", "-o", "a.gif"], ".png"),
         (["plot", "angle.safetensors", "-o", "a.png", "--grid", "4"], "--model"),
         (["export", "linear.safetensors", "-o", "a.onnx"], "imitation-flow"),
         (["score", "-", "-"], "one of the inputs"),
         (["import", "reach.csv", "-o", "reach.csv"], "which is one of them"),
+        (["import", "reach.csv", "reach.csv", "-o", "a"], "reach.csv again"),
         (["import", "reach.csv", "-o", "a", "--plot", "a.gif"], ".png"),
         (["import", "reach.csv", "-o", "a", "--format", "xyz"], "csv, npz"),
+        (["import", "reach.csv", "-o", "mine.csv"], "such as mine.safetensors"),
+        (["fit", "angle.safetensors", "-o", "m.onnx"], "such as m.safetensors"),
+        (["export", "linear.safetensors", "-o", "a.safetensors"], "such as a.onnx"),
+        (["rollout", "linear.safetensors", "--start", "1,2", "-o", "a.png"], "such as a.csv"),
         (["fit", "angle.safetensors", "-o", "angle.safetensors"], "which is one of them"),
         (["fit", "angle.safetensors", "-o", ""], "an empty name"),
         (["fit", "angle.safetensors", "-o", "m", "--seed", "-1"], "seed >= 0"),
@@ -186,7 +226,7 @@ def test_what_is_not_understood_is_2_and_says_why(call, arguments, message):
     [
         (["import", "absent.csv", "-o", "a"], "absent.csv"),
         (["import", "reach.csv", "-o", "a", "--time", "stamp"], "'stamp'"),
-        (["fit", "reach.csv", "-o", "m"], "iflow-gym import"),
+        (["fit", "reach.csv", "-o", "m"], "import reach.csv -o reach.safetensors"),
         (["score", "absent", "angle.safetensors"], "Expected a model at absent"),
         (["fit", "angle.safetensors", "-o", "m", "--set", "device=tpu"], "could not be fitted"),
         (["draw", "--no-open", "--port", "70000"], "from 0 to 65535"),
@@ -223,6 +263,18 @@ def test_import_reports_draws_and_writes(call, folder):
     assert {"columns", "units", "kind"} <= {entry["step"] for entry in report["report"]}
     assert all(entry["text"] in said for entry in report["report"])
     assert (folder / "reach.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_one_recording_alone_is_said_to_be_one(call, folder):
+    (folder / "one.csv").write_text(CSV.rpartition("0.000,")[0])
+    assert "One recording alone" in call("import", "one.csv", "-o", "one.safetensors")[2]
+    assert "One recording alone" not in call("import", "reach.csv", "-o", "two.safetensors")[2]
+
+
+def test_what_was_there_and_is_replaced_is_said(call):
+    line = ("import", "reach.csv", "-o", "twice.safetensors")
+    assert "Replaced" not in call(*line)[2]
+    assert "Replaced twice.safetensors, which was there already." in call(*line)[2]
 
 
 def test_fit_writes_a_model_that_says_what_it_was_fitted_on(call, folder):
@@ -271,6 +323,25 @@ def test_score_is_the_evaluations(call, folder):
         assert told["metrics"][name] == expected[name]
     assert told["guarantee"]["kind"] == "proved"
     assert told["recordings_seen_in_fit"] == 7
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "score linear.safetensors metres.safetensors",
+        "plot metres.safetensors --model linear.safetensors -o a.png",
+        "rollout linear.safetensors --motion metres.safetensors",
+    ],
+)
+def test_a_model_and_a_motion_of_different_units_are_refused(call, folder, line):
+    motion = load_demonstrations(folder / "angle.safetensors")
+    metres = Demonstrations.from_arrays(
+        [p / 1000 for p in motion.positions], dt=motion.dt, length_unit="m", goal_tolerance=1.0
+    )
+    save_demonstrations(metres, folder / "metres.safetensors")
+    status, output, said = call(*line.split())
+    assert (status, output) == (2, "")
+    assert "a model in mm and a motion in m: import" in said
 
 
 def test_score_prints_a_table_with_units_and_the_guarantee(call):
@@ -334,6 +405,9 @@ def test_a_rollouts_velocity_is_the_slope_of_its_path(call):
 
 def test_rollouts_from_a_file_of_starts_and_of_a_motion(call, folder):
     (folder / "starts.csv").write_text("x,y\n-40,20\n10;10\n")
+    _, output, _ = call("rollout", "linear.safetensors", "--start=-40,20")
+    longest = load_demonstrations(folder / "angle.safetensors").durations.max()
+    assert rows(output)[-1]["t"] == pytest.approx(longest, rel=0.02)
     times = ("--dt", "0.1", "--duration", "0.2")
     _, output, _ = call("rollout", "linear.safetensors", "--starts", "starts.csv", *times)
     assert len(rows(output)) == 6
@@ -367,6 +441,24 @@ def test_plot_draws_motions_in_space_over_time(call, folder):
     )
     assert call("plot", "space", "-o", "space.png")[0] == 0
     assert call("plot", "space", "-o", "space.png", "--model", "linear.safetensors")[0] == 2
+
+
+def test_an_exported_file_says_what_a_controller_asks_for(call, folder):
+    pytest.importorskip("onnx")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    line = ("fit", "angle.safetensors", "-o", "flow.safetensors", "--set", "n_steps=2")
+    assert call(*line)[0] == 0
+    status, output, said = call("export", "flow.safetensors", "-o", "flow.onnx")
+    assert (status, "of the states' size" in said) == (0, True)
+    motion = load_demonstrations(folder / "angle.safetensors")
+    start = [round(float(c), 6) for c in motion.starts[0]]
+    assert f"x = np.array([{start}])  # where you are, in mm" in output
+    session = onnxruntime.InferenceSession(str(folder / "flow.onnx"))
+    about = {k: json.loads(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
+    assert (about["length_unit"], about["goal"]) == ("mm", pytest.approx(motion.goal.tolist()))
+    assert about["sample_time"] == pytest.approx(motion.mean_dt)
+    assert "period" not in about
+    exec(output, {})  # what it prints runs
 
 
 def test_methods_lists_all_and_the_settings_of_one(call):

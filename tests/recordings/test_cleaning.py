@@ -1,6 +1,7 @@
 """The whole clean-up, the kind of motion, and the file that comes of it."""
 
 import contextlib
+import re
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from iflow_gym.demonstration_files import (
 )
 from iflow_gym.recordings import CleanUp, RawRecording, RecordingError, clean
 from iflow_gym.recordings.kinds import cut_to_rounds, decide
+from iflow_gym.recordings.picture import cleaning_figure
 
 
 def raw(demonstrations, every=1):
@@ -117,6 +119,9 @@ def test_everything_that_is_done_is_noted():
     cleaned = clean(recordings, options)
     steps = [n.step for n in cleaned.notes if n.recording in ("", "a")]
     assert steps == ["units", "times", "missing", "trim", "resample", "smooth", "kind", "align"]
+    texts = {n.step: n.text for n in cleaned.notes if n.recording == "a"}
+    assert re.search(r"by [\d.e-]+ m RMS and .* m at most; .* by [\d.e-]+ m$", texts["smooth"])
+    assert re.fullmatch(r"shifted by [\d.]+ m to end at the goal", texts["align"])
     motion = cleaned.demonstrations
     assert motion.length_unit == "m"
     np.testing.assert_allclose(motion.goal, [0.0015, 0.05], atol=2e-3)
@@ -132,8 +137,9 @@ def test_everything_that_is_done_is_noted():
         ({"period": 1.0, "kind": "goal"}, "drop one"),
         ({"kind": "cycle", "align": "shift"}, "to have no goal"),
         ({"still": 2.0}, "still from 0 to below 1"),
-        ({"hold_out": 7}, "held_out"),
-        ({"goal": (9.0, 9.0)}, "--align shift"),
+        ({"hold_out": 7}, "--hold-out"),
+        ({"goal": (9.0, 9.0)}, r"within [\d.]+ mm of one goal.* mm away.*--align shift"),
+        ({"still": 0.9}, r"\d\d% of its diagonal: count less as still"),
         ({"period": -1.0}, "period > 0"),
     ],
 )
@@ -142,7 +148,7 @@ def test_options_that_do_not_fit_say_what_to_do(options, message):
         [circle(3.0)] if options.get("kind") == "cycle" else raw(load_lasa("Line"), every=10)
     )
     with pytest.raises(RecordingError, match=message):
-        clean(recordings, CleanUp(**options))
+        clean(recordings, CleanUp(**{"unit": "mm", **options}))
 
 
 def test_uneven_samples_are_refused_where_resampling_is_left_out():
@@ -160,6 +166,33 @@ def test_a_cycle_of_ones_own_is_scored_as_one():
         4,
         5,
     ]
+
+
+def test_strokes_in_one_recording_are_split_into_demonstrations():
+    stroke = raw(load_lasa("Angle"), every=10)[0]
+    times = np.concatenate([stroke.times + i * (stroke.times[-1] + 3.0) for i in range(3)])
+    one = RawRecording("one", times, np.tile(stroke.positions, (3, 1)))
+    with pytest.raises(RecordingError, match="--split 1"):
+        clean([one], CleanUp())
+    cleaned = clean([one], CleanUp(split=1.0))
+    assert len(cleaned.demonstrations) == len(cleaned.before) == 3
+    assert cleaned.demonstrations.goal is not None
+    assert [r.times[0] for r in cleaned.before] == [0.0, 0.0, 0.0]
+    assert len(clean([one], CleanUp(split=9.0, kind="cycle", cut=False)).demonstrations) == 1
+
+
+@pytest.mark.parametrize("tall", [0.1, 0.5, 1.0])
+def test_the_picture_of_a_flat_motion_has_no_white_bands(tall):
+    s = np.linspace(0, 1, 60)[:, None]
+    path = (1 - s) * [1.0, 0.0] + np.sin(np.pi * s) * [0.0, tall]
+    cleaned = clean([RawRecording("a", s[:, 0], path)], CleanUp(kind="goal", trim=False))
+    figure = cleaning_figure(cleaned)
+    figure.draw_without_rendering()
+    drawn = figure.axes[0].get_position()
+    room = figure.axes[0].get_position(original=True)
+    inches = figure.get_size_inches()[1]
+    assert (room.height - drawn.height) * inches < 0.8
+    assert inches <= 6.6
 
 
 # The file -----------------------------------------------------------------------------------

@@ -182,7 +182,15 @@ def test_the_caller_names_what_is_what():
 
 ERRORS = {
     "no such column": ("csv", text(TABLE), Columns(positions=("x", "z")), "Did you mean|'z'"),
-    "a word": ("csv", text(TABLE).replace(b"0.1,", b"soon,", 1), None, "'soon' in row 2"),
+    "a word": ("csv", text(TABLE).replace(b"0.1,", b"soon,", 1), None, "'soon' in line 3"),
+    "a word below a comment": (
+        "csv",
+        b"# pen\n\n" + text(TABLE).replace(b"0.1,", b"soon,", 1),
+        None,
+        "line 5",
+    ),
+    "other names": ("csv", text({"zeit": T, "x": T, "y": T}), None, "got zeit, x, y: name"),
+    "no heading and a group": ("csv", b"1,0,2,3\n1,1,2,3", None, "--group 0 --time 1"),
     "a row too short": ("csv", text(TABLE) + b"\n1,2", None, "5 cells in line 10.*got 2"),
     "no heading": ("csv", b"\n".join(text(TABLE).split(b"\n")[1:]), None, "--positions 1 2"),
     "no times": ("csv", text({"x": T, "y": T}), None, "--dt"),
@@ -211,6 +219,14 @@ def test_errors_say_what_was_expected_and_what_came(kind, content, columns, mess
     with pytest.raises(RecordingError, match=message) as found:
         read(content, kind, columns)
     assert "xpected" in str(found.value)
+
+
+def test_recordings_of_a_table_without_a_heading_are_named_in_words():
+    content = text({"g": NUMBERED, **TWICE}).split(b"\n", 1)[1]
+    columns = Columns(group="0", time="1", positions=("2", "3"))
+    assert [r.name for r in read(content, "csv", columns).recordings] == [
+        "it, recording 1", "it, recording 2",
+    ]  # fmt: skip
 
 
 def test_names_that_do_not_tell_the_format(tmp_path):
@@ -284,3 +300,12 @@ def test_a_damaged_file_gives_recordings_or_the_clear_error(name, data):
     with contextlib.suppress(RecordingError):  # anything else is a failure
         recordings = read(bytes(content), kind).recordings
         assert all(r.positions.dtype == np.float64 for r in recordings)
+
+
+@pytest.mark.parametrize(
+    ("name", "apart", "doubted"), [("t", 10.0, True), ("t", 0.1, False), ("t_ms", 10.0, False)]
+)
+def test_seconds_that_hardly_are_are_doubted(name, apart, doubted):
+    table = {name: np.arange(8) * apart, "x": P[:, 0], "y": P[:, 1]}
+    reading = read_recordings([Source("pen.csv", content=text(table))], format="csv")
+    assert ("--time-unit ms" in str(reading.notes[0])) is doubted

@@ -6,11 +6,13 @@ import pytest
 from iflow_gym.recordings.raw import RawRecording, RecordingError
 from iflow_gym.recordings.steps import (
     aligned,
+    check_gaps,
     in_order,
     resampled,
     scaled,
     scatter,
     smoothed,
+    split_at_gaps,
     trimmed,
     without_gaps,
 )
@@ -194,6 +196,22 @@ def test_scatter_is_the_noise_and_not_the_motion():
     assert scatter(noisy(clean, 0.003)) == pytest.approx(0.003 * np.sqrt(2), rel=0.1)
 
 
+def test_many_rounds_are_smoothed_and_keep_their_shape():
+    """7 % of eight rounds is half a round: as a window it would leave a dot."""
+    times = np.arange(1500) * 0.01
+    angle = 2 * np.pi * times / 1.9
+    clean = RawRecording("stir", times, np.stack([np.cos(angle), 0.6 * np.sin(2 * angle)], axis=1))
+    rough = noisy(clean, 0.005)
+    smooth, note = smoothed(rough)
+    assert note is not None
+    assert note.values["moved_rms"] <= 1.5 * note.values["scatter"]
+
+    def most(recording):
+        return np.linalg.norm(recording.positions - clean.positions, axis=1).max()
+
+    assert most(smooth) < most(rough)
+
+
 def test_what_scatters_is_smoothed_by_itself_and_comes_closer_to_the_truth():
     times = np.arange(300) * 0.01
     clean = line(times, duration=3.0)
@@ -250,3 +268,52 @@ def test_units_scale_lengths_times_and_velocities():
     np.testing.assert_allclose(metric.times, [0, 1e-3, 2e-3])
     np.testing.assert_allclose(metric.positions, 1e-3)
     np.testing.assert_allclose(metric.velocities, 1.0)
+
+
+# Gaps ---------------------------------------------------------------------------------------
+
+
+def strokes(pause, n=3, step=0.01):
+    """n times the same stroke of 1 s in one recording, with pauses in which nothing is recorded."""
+    t = np.arange(101) * step
+    times = np.concatenate([t + i * (1.0 + pause) for i in range(n)])
+    return RawRecording("strokes.csv", times, np.tile(line(t).positions, (n, 1)))
+
+
+def test_strokes_with_pauses_between_are_no_one_motion():
+    with pytest.raises(RecordingError) as caught:
+        check_gaps(strokes(3.64))
+    for part in ("2 gaps, the longest of 3.64 s", "from 1 to 4.64 s", "--split 1)", "--split 4)"):
+        assert part in str(caught.value)
+    pieces, note = split_at_gaps(strokes(3.64), 1.0)
+    assert [len(p) for p in pieces] == [101, 101, 101]
+    assert [p.name for p in pieces] == [f"strokes.csv, part {i}" for i in (1, 2, 3)]
+    assert (note.step, note.values["recordings"]) == ("split", 3)
+    assert split_at_gaps(strokes(3.64), 4.0)[1] is None
+    for seconds in (0.0, -1.0, np.nan):
+        with pytest.raises(RecordingError, match="--split"):
+            split_at_gaps(strokes(1.0), seconds)
+
+
+def test_a_gap_is_judged_by_the_stretches_between_gaps_and_not_by_the_whole():
+    """Of many strokes each pause is a small part."""
+    with pytest.raises(RecordingError, match="59 gaps"):
+        check_gaps(strokes(0.5, n=60))
+
+
+def test_lost_samples_are_bridged():
+    """Sixty of two thousand, and a second in which nothing moved."""
+    fast = line(np.arange(2000) * 5e-4)
+    check_gaps(fast.take(np.abs(np.arange(2000) - 1000) > 30))
+    still = line(np.arange(300) * 0.01, begin=1.9)
+    check_gaps(still.take(np.abs(np.arange(300) - 100) > 50))
+
+
+def test_holes_between_pieces_are_gaps_and_backward_times_are_none():
+    holes = strokes(0.0, n=2)
+    times, path = np.arange(len(holes)) * 0.01, holes.positions.copy()
+    path[90:140] = np.nan
+    pieces, _ = split_at_gaps(RawRecording("a", times, path), 0.3)
+    assert [int(p.whole.sum()) for p in pieces] == [90, 62]
+    back = with_times(0.0, 0.1, 5.0, 0.2, 5.1, 5.2)
+    assert [len(p) for p in split_at_gaps(back, 1.0)[0]] == [2, 4]
