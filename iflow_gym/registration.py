@@ -5,6 +5,8 @@ Any change that may change a score bumps an id's version.
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
@@ -63,18 +65,39 @@ def matching_ids(patterns: Iterable[str], ids: Sequence[str]) -> list[str]:
     Raises
     ------
     UnknownNameError
-        For a pattern that matches none.
+        For a pattern that matches none, with the nearest ids and how to list all.
     """
-    from iflow_gym.baselines.registry import unknown
+    from iflow_gym.baselines.registry import UnknownNameError
 
-    names = {i: (i, i.partition("/")[2], i.partition("/")[2].rpartition("-v")[0]) for i in ids}
+    names = {i: (i, i.partition("/")[2], short_name(i)) for i in ids}
     chosen: dict[str, None] = {}
     for pattern in patterns:
         found = [i for i, known in names.items() if any(fnmatchcase(n, pattern) for n in known)]
         if not found:
-            raise unknown("environment", pattern, [short for _, short, _ in names.values()])
+            raise UnknownNameError(
+                f"Unknown environment {pattern!r}.{did_you_mean(pattern, ids)} `iflow-gym envs` "
+                "lists them all."
+            )
         chosen |= dict.fromkeys(found)
     return list(chosen)
+
+
+def short_name(env_id: str) -> str:
+    """Return an id without its namespace and its version: ``LASA-Angle`` of iflow/LASA-Angle-v0."""
+    return env_id.partition("/")[2].rpartition("-v")[0]
+
+
+def did_you_mean(name: str, ids: Iterable[str]) -> str:
+    """Return a sentence with those of some ids that a name is likely to mean; empty if none is."""
+    known = [short_name(i) for i in ids]
+    words: dict[str, list[str]] = {}  # whole names, and what is after the family
+    for short in known:
+        for word in {short.lower(), short.lower().rpartition("-")[2]}:
+            words.setdefault(word, []).append(short)
+    sought = re.sub(r"-v\d*$", "", name.lower().removeprefix("iflow/").strip("*"))
+    near = [s for w in difflib.get_close_matches(sought, words, n=3, cutoff=0.7) for s in words[w]]
+    near = list(dict.fromkeys(near))[:3]
+    return f" Did you mean {' or '.join(near)}?" if near else ""
 
 
 def _register(

@@ -95,7 +95,7 @@ def test_names_that_are_none_are_answered_with_the_nearest():
         load_method("liner")
     with pytest.raises(UnknownNameError, match="Did you mean replay"):
         plan.select_entries(["replai"], "smoke")
-    with pytest.raises(UnknownNameError, match="Did you mean LASA-Angle-v0"):
+    with pytest.raises(UnknownNameError, match="Did you mean LASA-Angle"):
         plan.select_environments(["LASA-Angel-v0"])
     with pytest.raises(UnknownNameError, match="LASA-Angle-v0"):
         plan.select_environments(["Angle"])

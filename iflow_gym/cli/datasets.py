@@ -214,7 +214,10 @@ class ExportMinari:
         try:
             chosen = matching_ids(self.patterns, exportable())
         except UnknownNameError as error:
-            raise UsageError(str(error)) from error
+            raise UsageError(
+                f"{error} Those without demonstrations of their own, PointMass and Disturbed, are "
+                "not exported."
+            ) from error
         if not chosen:
             raise UsageError("Expected environments to export, such as LASA-Angle, got none.")
         with counted("Exporting", len(chosen)) as advance:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from iflow_gym.cli.console import PIPE, UsageError, input_bytes, input_path
@@ -33,8 +34,6 @@ def environment_id(name: str) -> str | None:
 
 def load_motion(name: str) -> tuple[Demonstrations, str | None]:
     """Return the demonstrations of a file, of ``-``, or of an environment, and that one's id."""
-    from pathlib import Path
-
     from iflow_gym.demonstration_files import (
         demonstrations_from_bytes,
         load_demonstrations,
@@ -42,7 +41,7 @@ def load_motion(name: str) -> tuple[Demonstrations, str | None]:
 
     if name == PIPE:
         return demonstrations_from_bytes(input_bytes(), "standard input").demonstrations, None
-    if not Path(name).exists():
+    if not Path(name).exists() or Path(name).is_dir():
         env_id = environment_id(name)
         if env_id is None:
             raise UsageError(_unknown(name))
@@ -54,18 +53,12 @@ def load_motion(name: str) -> tuple[Demonstrations, str | None]:
 
 
 def _unknown(name: str) -> str:
-    import difflib
+    from iflow_gym.registration import did_you_mean, registered_ids
 
-    import gymnasium
-
-    known = [
-        i.removeprefix("iflow/").rpartition("-v")[0] for i in gymnasium.registry if "iflow/" in i
-    ]
-    near = difflib.get_close_matches(name.removeprefix("iflow/").rpartition("-v")[0] or name, known)
-    hint = f" Did you mean {', '.join(near)}?" if near else ""
+    came = "a folder" if name and Path(name).is_dir() else "neither"
     return (
         f"Expected a motion, a file that `iflow-gym import` wrote or an environment of `iflow-gym "
-        f"envs`, got {name!r}, which is neither.{hint}"
+        f"envs`, got {name!r}, which is {came}.{did_you_mean(name, registered_ids())}"
     )
 
 
