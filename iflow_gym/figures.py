@@ -326,7 +326,7 @@ def _place_labels(
                 color=INK,
                 arrowprops=(
                     None
-                    if distance <= 20
+                    if distance <= 10 and not (aside and up)  # beyond, it may seem another's
                     else {"arrowstyle": "-", "color": style.colour, "linewidth": 0.8, "shrinkB": 6}
                 ),
             )
