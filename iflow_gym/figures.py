@@ -16,6 +16,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
@@ -240,12 +241,17 @@ def scatter_figure(
             [p.x], [p.y], style.marker, color=style.colour, markersize=10, markeredgecolor="white",
             markeredgewidth=1.0, zorder=4, clip_on=False,
         )  # fmt: skip
+    marks: list[Artist] = []
     for label, value in (references or {}).items():
-        ax.axvline(value, color=REFERENCE_COLOUR, linestyle="--", linewidth=1.2, zorder=1)
-        ax.annotate(
-            label, (value, 0.02), xycoords=("data", "axes fraction"), rotation=90, fontsize=8,
-            xytext=(-4, 0), textcoords="offset points", ha="right", va="bottom",
-            color=REFERENCE_COLOUR,
+        marks.append(
+            ax.axvline(value, color=REFERENCE_COLOUR, linestyle="--", linewidth=1.2, zorder=1)
+        )
+        marks.append(
+            ax.annotate(
+                label, (value, 0.02), xycoords=("data", "axes fraction"), rotation=90, fontsize=8,
+                xytext=(-4, 0), textcoords="offset points", ha="right", va="bottom",
+                color=REFERENCE_COLOUR,
+            )
         )  # fmt: skip
     ax.set_xlabel(x_label, color=INK)
     ax.set_ylabel(y_label, color=INK)
@@ -269,21 +275,28 @@ def scatter_figure(
             frameon=False,
             fontsize=9,
         )
-    _place_labels(figure, ax, kept, styles)
+    _place_labels(figure, ax, kept, styles, marks)
     return figure
 
 
 def _place_labels(
-    figure: Figure, ax: Axes, points: Sequence[Point], styles: Mapping[str, MethodStyle]
+    figure: Figure,
+    ax: Axes,
+    points: Sequence[Point],
+    styles: Mapping[str, MethodStyle],
+    marks: Sequence[Artist],
 ) -> None:
-    """Write names beside points, each at the first of several places where nothing is yet."""
+    """Write names beside points, each at the first of several places where nothing is yet.
+
+    `marks` is what else is drawn that no name is to cross.
+    """
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()  # the layout, and with it every position in pixels, is known from here on
     figure.set_layout_engine("none")
     renderer = canvas.get_renderer()
     pixels = figure.dpi / 72
     frame = ax.get_window_extent(renderer)
-    taken = []
+    taken = [mark.get_window_extent(renderer).padded(2 * pixels) for mark in marks]
     for p in points:
         (left, right), (low, high) = p.x_interval or (p.x, p.x), p.y_interval or (p.y, p.y)
         for reach, ends in (
@@ -313,13 +326,13 @@ def _place_labels(
                 color=INK,
                 arrowprops=(
                     None
-                    if distance <= 20
+                    if distance <= 10 and not (aside and up)  # beyond, it may seem another's
                     else {"arrowstyle": "-", "color": style.colour, "linewidth": 0.8, "shrinkB": 6}
                 ),
             )
             # Of the letters: the annotation's own extent would hold the line to the point, too.
             text.update_positions(renderer)
-            box = Text.get_window_extent(text, renderer).padded(1.5 * pixels)
+            box = Text.get_window_extent(text, renderer).padded(2.5 * pixels)
             inside = frame.containsx(box.x0) and frame.containsx(box.x1)
             inside &= frame.containsy(box.y0) and frame.containsy(box.y1)
             if inside and not any(box.overlaps(other) for other in taken):

@@ -143,6 +143,18 @@ class Row:
             for environment in self.environments
         }
 
+    def run_scores(self, metric: str) -> dict[str, NDArray[np.float64]]:
+        """Return environment -> scores of the seeds that were run there; nan where one failed.
+
+        Environments without a cell are not in it.
+        """
+        found: dict[str, list[float]] = {}
+        for environment in self.environments:
+            for seed in self.seeds:
+                if (environment, seed) in self.cells:
+                    found.setdefault(environment, []).append(self._score(metric, environment, seed))
+        return {environment: np.array(scores) for environment, scores in found.items()}
+
     def _score(self, metric: str, environment: str, seed: int) -> float:
         cell = self.cells.get((environment, seed))
         value = cell.metrics.get(metric) if cell is not None and cell.ok else None
@@ -202,6 +214,13 @@ class Board:
         return tuple(row for row in self.rows if row.competes)
 
     @property
+    def fullest(self) -> tuple[Row, ...]:
+        """Competitors that have scores of as many of their cells as any."""
+        share = {row.method: row.n_scored / row.n_expected for row in self.competitors}
+        most = max(share.values(), default=0.0)
+        return tuple(row for row in self.competitors if share[row.method] == most > 0)
+
+    @property
     def methods(self) -> tuple[Row, ...]:
         """Rows that were fitted: all but the references."""
         return tuple(row for row in self.rows if not row.reference)
@@ -218,13 +237,12 @@ class Board:
         easiest environments is no better than one over all.
         """
         better = get_metric(metric).better if metric != "mean_rank" else "lower"
-        share = {row.method: row.n_scored / row.n_expected for row in self.competitors}
-        fullest = max(share.values(), default=0.0)
+        full = {row.method for row in self.fullest}
         sign = 1.0 if better == "lower" else -1.0
         fit = {
             name: sign * value
             for name, value in values.items()
-            if share.get(name) == fullest > 0 and not np.isnan(value)
+            if name in full and not np.isnan(value)
         }
         return {name for name, value in fit.items() if value == min(fit.values())}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -51,34 +52,38 @@ def rank_comparison(board: Board) -> RankComparison | None:
 
 
 def improvements(board: Board) -> dict[tuple[str, str], Improvement]:
-    """Return how likely each competitor is better than each other by the main metric."""
-    metric, kept = MAIN[board.motion], tried(board)
-    scores = {row.method: row.scores(metric) for row in compared(board)}
-    better = get_metric(metric).better
-    return {
-        (one, other): probability_of_improvement(
-            [scores[one][e] for e in kept], [scores[other][e] for e in kept], better
-        )
-        for one in scores
-        for other in scores
-        if one != other and kept
-    }
+    """Return how likely each competitor is better than each other by the main metric.
+
+    Over the environments and seeds that were run: a failed cell is the worst, one that was never
+    run says nothing. A pair that was never run on the same environment is left out.
+    """
+    metric = MAIN[board.motion]
+    scores = {row.method: row.run_scores(metric) for row in compared(board)}
+    found = {}
+    for one, other in itertools.permutations(scores, 2):
+        shared = [e for e in scores[one] if e in scores[other]]
+        if shared:
+            found[one, other] = probability_of_improvement(
+                [scores[one][e] for e in shared],
+                [scores[other][e] for e in shared],
+                get_metric(metric).better,
+            )
+    return found
 
 
 def profiles(board: Board) -> dict[str, Profile]:
     """Return the distributions of all fitted methods' scores by the main metric.
 
+    Of the cells that were run; none where fewer than two environments were.
     Thresholds span the finite scores, evenly on a logarithmic scale where all are positive and the
     metric is an error, and else evenly.
     """
     metric = MAIN[board.motion]
     rows = [row for row in board.methods if row.applies(metric)]
-    ran = {environment for row in rows for environment, _ in row.cells}
-    kept = [environment for environment in board.environments if environment in ran]
-    if not rows or len(kept) < 2:
+    if len({environment for row in rows for environment, _ in row.cells}) < 2:
         return {}
-    scores = {row.method: row.scores(metric) for row in rows}
-    pooled = np.concatenate([np.concatenate([s[e] for e in kept]) for s in scores.values()])
+    scores = {row.method: list(row.run_scores(metric).values()) for row in rows}
+    pooled = np.concatenate([np.concatenate(own) for own in scores.values()])
     finite = pooled[np.isfinite(pooled)]
     better = get_metric(metric).better
     if better == "lower" and (finite > 0).all() and len(finite):
@@ -87,10 +92,7 @@ def profiles(board: Board) -> dict[str, Profile]:
         at[-1] = max(at[-1], finite.max())
     else:
         at = np.linspace(0.0, float(finite.max(initial=1.0)), N_THRESHOLDS)
-    return {
-        name: performance_profile([own[e] for e in kept], at, better)
-        for name, own in scores.items()
-    }
+    return {name: performance_profile(own, at, better) for name, own in scores.items()}
 
 
 def is_logarithmic(found: dict[str, Profile]) -> bool:

@@ -251,12 +251,17 @@ def number_figures(board: Board) -> dict[str, Callable[[], Figure]]:
         "accuracy-stability": lambda: accuracy_stability(board, styles, unit),
         "accuracy-fit-time": lambda: accuracy_fit_time(board, styles, unit),
     }
-    if len(board.environments) >= FEWEST_FOR_BOXES:
+    if n_run(board) >= FEWEST_FOR_BOXES:
         found["boxes"] = lambda: boxes(board, styles, unit)
         found["profile"] = lambda: profile(board, styles, unit)
     if rank_comparison(board) is not None:
         found["ranks"] = lambda: ranks(board)
     return found
+
+
+def n_run(board: Board) -> int:
+    """Return the number of environments that a method was run on."""
+    return len({environment for row in board.methods for environment, _ in row.cells})
 
 
 def styles_of(board: Board) -> dict[str, MethodStyle]:

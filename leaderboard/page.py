@@ -188,6 +188,13 @@ def _one_line(reason: str) -> str:
     return escaped(first)
 
 
+SMOKE = (
+    "the smoke preset, in which methods of the suite are fitted in a few steps. They say that "
+    "everything runs, and are no scores to quote."
+)
+"""What records of this preset are."""
+
+
 def warnings_about(results: Sequence[Result]) -> list[str]:
     """Return what makes the records hard to compare, one sentence each."""
     found: list[str] = []
@@ -196,10 +203,10 @@ def warnings_about(results: Sequence[Result]) -> list[str]:
         current = metrics_hash(motion)
         counts = Counter(r.hashes.get("metrics", "none") for r in alike)
         if len(counts) > 1:
-            listing = ", ".join(f"{name[:12]} ({n} cells)" for name, n in sorted(counts.items()))
             found.append(
-                f"The records were scored by different versions of the metrics: {listing}. Their "
-                "numbers do not mean the same; run `python baselines/run_all.py` again."
+                "The records were scored by different versions of the metrics: "
+                f"{_counted(counts)}. Their numbers do not mean the same until "
+                "`python baselines/run_all.py` is run again."
             )
         elif counts and set(counts) != {current}:
             found.append(
@@ -219,9 +226,15 @@ def warnings_about(results: Sequence[Result]) -> list[str]:
         if len(used) > 1:
             found.append(f"The records were made with different versions of {library}: {used}.")
     if len(presets := sorted({r.preset for r in results})) > 1:
-        found.append(f"The records are of different presets: {', '.join(presets)}.")
-    elif presets == ["smoke"]:
-        found.append("The records are of the smoke preset, whose few steps are no scores to quote.")
+        found.append(
+            f"The records are of different presets: {', '.join(presets)}. A preset is how many "
+            "seeds were run and with which settings; *Cells* and each method's details say it."
+        )
+    n_smoke = sum(r.preset == "smoke" for r in results)
+    if n_smoke == len(results) > 0:
+        found.append(f"This is a trial: all its records are of {SMOKE}")
+    elif n_smoke:
+        found.append(f"{n_smoke} of the {len(results)} records are of a trial, {SMOKE}")
     if len({str(r.hardware.get("cpu")) for r in results}) > 1:
         found.append("The records were made on different processors: costs do not compare.")
     return found
@@ -237,11 +250,18 @@ def _mixed_rows(results: Sequence[Result]) -> list[str]:
     what = {"code": "versions of its code", "config": "settings in the preset"}
     return [
         f"The records of {title} were made with different {f'{what[label]} {where}'.rstrip()}: "
-        + ", ".join(f"{name[:12]} ({n} cells)" for name, n in sorted(counts.items()))
-        + "; run `python baselines/run_all.py` again."
+        f"{_counted(counts)}. Its rows mix them until `python baselines/run_all.py` is run again."
         for (title, label, where), counts in sorted(groups.items())
         if len(counts) > 1
     ]
+
+
+def _counted(counts: Counter[str]) -> str:
+    """Return how many cells each version made, the most first."""
+    return ", ".join(
+        f"{n} {'cell' if n == 1 else 'cells'} by {name[:12]}"
+        for name, n in sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    )
 
 
 def contradictions(board: Board) -> list[str]:
@@ -254,6 +274,7 @@ def contradictions(board: Board) -> list[str]:
             if c.guarantee is not None and c.guarantee.kind == "proved"
         ]
         for metric, held, says in (
+            ("diverged", 0.0, "starts ran away"),
             ("converged", 1.0, "not every start converged within the horizon"),
             ("attraction", 1.0, "not every start was attracted within the horizon"),
             ("lyapunov_violation", 0.0, "its Lyapunov function does not fall everywhere"),
@@ -347,7 +368,7 @@ def comparison_section(board: Board, figures: Mapping[str, str]) -> list[str]:
         [
             escaped(one.title),
             *(
-                "" if one is other else percent_of(found[one.method, other.method])
+                percent_of(pair) if (pair := found.get((one.method, other.method))) else ""
                 for other in rows
             ),
         ]
@@ -387,17 +408,18 @@ def improvement_in_words(found: Mapping[tuple[str, str], Improvement]) -> str:
     said = " and ".join(what[name] for name in ("seeds", "environments") if name in drawn)
     return (
         "Probability (%) that a run of the row's method is better than one of the column's on an "
-        "environment drawn at random, a tie counting half and a failed cell as the worst (Agarwal "
-        "et al. 2021)" + (f"; 95 % bootstrap intervals {said}." if said else ".")
+        "environment drawn at random that both were run on, a tie counting half and a failed cell "
+        "as the worst; cells that were never run are left out (Agarwal et al. 2021)"
+        + (f"; 95 % bootstrap intervals {said}." if said else ".")
     )
 
 
 CAPTIONS = {
     "ranks": "Mean ranks over the environments, 1 is best: methods under one bar cannot be told "
     "apart at 5 %.",
-    "profile": "Share of a method's cells that are as good as the value on the x axis or better; a "
-    "curve further up and to the left is better, and what failed keeps it below 100 %. Bands are "
-    "95 % bootstrap intervals.",
+    "profile": "Share of a method's cells, of those that were run, that are as good as the value "
+    "on the x axis or better; a curve further up and to the left is better, and what failed keeps "
+    "it below 100 %. Bands are 95 % bootstrap intervals.",
     "accuracy-stability": "Accuracy against stability on LASA-26, reproduction: to the upper left "
     "a method follows the demonstrations and ends where they end. Bars are 95 % intervals.",
     "boxes": "The four measures of the ImitationFlow paper's figure 3 over the LASA-26 shapes, a "

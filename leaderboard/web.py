@@ -17,7 +17,7 @@ from typing import Any
 from board import HOLDS, MAIN, RANKED, Board, Row
 from classes import confusion, fraction_right
 from comparisons import FEWEST_ENVIRONMENTS, compared, improvements, rank_comparison
-from drawings import Drawing, first_cell, number_figures
+from drawings import FEWEST_FOR_BOXES, Drawing, first_cell, n_run, number_figures
 from inline import Styles, inline_svg, moving_webp, panel_pictures, webp
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -174,6 +174,7 @@ def render(
             for m in METRICS
         ],
         ranked={KINDS[m]: [get_metric(n).title for n in RANKED[m]] for m in _motions(boards)},
+        trial=all(result.preset == "smoke" for result in results),
         warnings=[plain(note) for note in warnings_about(results)],
         memory=MEMORY,
         versions=versions_of(results),
@@ -215,18 +216,18 @@ def plain(text: str) -> str:
 
 
 def links(output: Path) -> dict[str, str]:
-    """Return addresses of documents relative to the page; none for a page outside the checkout."""
+    """Return addresses of documents relative to the page; none from another drive."""
     folder = output.resolve()
-    if not folder.is_relative_to(REPOSITORY):
+    if folder.drive != REPOSITORY.drive:
         return {}
     targets = {
         "adding": "docs/adding-a-method.md",
+        "submissions": "docs/submissions.md",
         "metrics": "docs/metrics.md",
         "environments": "docs/environments.md",
         "readme": "README.md",
-        "markdown": "leaderboard/LEADERBOARD.md",
     }
-    return {
+    return {"markdown": "LEADERBOARD.md"} | {
         name: Path(os.path.relpath(REPOSITORY / target, folder)).as_posix()
         for name, target in targets.items()
     }
@@ -276,6 +277,7 @@ def board_context(
         "footnote": plain(footnote(board, found)),
         "outside": outside(board),
         "figures": [] if styles is None else number_pictures(board, styles),
+        "left_out": left_out(board),
         "ranks": rank_context(board, styles),
         "improvements": improvement_context(board),
         "confusions": confusions(board),
@@ -388,8 +390,8 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
     entries = entries_of(board, found, metric, statistic_of(metric))
     sign = 1.0 if get_metric(metric).better == "lower" else -1.0
     order = sorted(
-        (row for row in board.competitors if not math.isnan(entries[row.method].value)),
-        key=lambda row: (not _full(board, row), sign * entries[row.method].value),
+        (row for row in board.fullest if not math.isnan(entries[row.method].value)),
+        key=lambda row: sign * entries[row.method].value,
     )
     if not order:
         return []
@@ -398,18 +400,26 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
     text = f"{title} {entry.text} {bracket}".rstrip()
     if entry.interval:
         text += f" ({entry.interval})"
+    text += f", over {first.coverage} cells"
     beside = ""
     if len(order) > 1:
         second = order[1]
         beside = f"Next: {second.title}, {entries[second.method].text} {bracket}".rstrip()
         chance = improvements(board).get((first.method, second.method))
         if chance is not None and chance.n_environments > 1:
-            beside += f", worse with {100 * chance.probability:.0f} % probability"
+            beside += (
+                f"; on a motion drawn at random {first.title} is the better one with "
+                f"{100 * chance.probability:.0f} % probability"
+            )
         beside += "."
+    if less := [row for row in board.competitors if row not in board.fullest]:
+        names = ", ".join(f"{row.title} ({row.coverage})" for row in less)
+        beside += f" Not compared here, since incomplete: {names}."
     leading = board.best(board.mean_rank, "mean_rank")
     if leading and first.method not in leading:
         titles = " and ".join(row.title for row in board.competitors if row.method in leading)
         beside += f" Best mean rank over all metrics of accuracy: {titles}."
+    beside = beside.strip()
     result = [
         {"label": "Most accurate", "value": first.title, "text": text, "beside": beside},
         proved_card(board, found),
@@ -420,8 +430,8 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
         beside = f"For {first.title}; a step takes {shown('step_us', step.iqm)} µs."
         quick = [
             (a.iqm, row.title)
-            for row in board.competitors
-            if (a := found[row.method, "fit_seconds"]) is not None and _full(board, row)
+            for row in board.fullest
+            if (a := found[row.method, "fit_seconds"]) is not None
         ]
         if quick and min(quick)[1] != first.title:
             seconds, name = min(quick)
@@ -439,6 +449,8 @@ def proved_card(board: Board, found: Aggregates) -> dict[str, str]:
     rest = [row for row in proved if row not in whole]
     converge = "converged" if holds == "converged" else "were attracted"
     text = f"Proved, and all starts {converge}." if whole else ""
+    if less := [f"{row.title} {row.coverage} cells" for row in whole if not row.complete]:
+        text = f"{text[:-1]}, of what was run: {', '.join(less)}."
     if rest:
         shares = ", ".join(
             f"{row.title} {percent(a.mean)} %"
@@ -454,12 +466,6 @@ def proved_card(board: Board, found: Aggregates) -> dict[str, str]:
         "text": text.strip() or "No competitor has a proof on every cell.",
         "beside": "",
     }
-
-
-def _full(board: Board, row: Row) -> bool:
-    """Whether a row covers as many cells as the fullest one."""
-    return row.method in board.best(dict.fromkeys([r.method for r in board.competitors], 0.0),
-                                    "mean_rank")  # fmt: skip
 
 
 # Figures ------------------------------------------------------------------------------------
@@ -487,6 +493,17 @@ def number_pictures(board: Board, styles: Styles) -> list[dict[str, Any]]:
     ]
 
 
+def left_out(board: Board) -> str:
+    """Say why a board has no figures of all motions; nothing where it has them."""
+    n = n_run(board)
+    if n >= FEWEST_FOR_BOXES:
+        return ""
+    return (
+        f"How many motions are done how well, and boxes of every motion's scores, are drawn of "
+        f"{FEWEST_FOR_BOXES} motions or more; of this family {n} {'was' if n == 1 else 'were'} run."
+    )
+
+
 def rank_context(board: Board, styles: Styles | None) -> dict[str, Any] | None:
     """Return the tests of ranks and their figure."""
     comparison = rank_comparison(board)
@@ -511,9 +528,9 @@ def improvement_context(board: Board) -> dict[str, Any] | None:
     few = len(board.environments) < FEWEST_ENVIRONMENTS
 
     def entry(one: Row, other: Row) -> dict[str, str] | None:
-        if one is other:
-            return None
-        p = found[one.method, other.method]
+        p = found.get((one.method, other.method))
+        if p is None:
+            return {"text": "–", "interval": "", "share": "0"} if one is not other else None
         low, high = (f"{100 * end:.0f}" for end in p.interval)
         return {
             "text": f"{100 * p.probability:.0f}",

@@ -198,6 +198,19 @@ def test_a_failed_cell_loses_to_every_other(builder):
     assert rows["Good"][header.index("Bad")].startswith("50<br><sub>")
 
 
+def test_a_cell_that_was_never_run_is_no_defeat(builder):
+    results = [*sweep("good", 1.0, shapes=SINGLE_MOTIONS[13:]), *sweep("bad", 2.0)]
+    results += sweep("elsewhere", 3.0, shapes=SINGLE_MOTIONS[:13])
+    (board,) = boards_of(builder, results)
+    found = builder.comparisons.improvements(board)
+    assert found["good", "bad"].probability == 1.0
+    assert found["good", "bad"].n_environments == 13
+    assert ("good", "elsewhere") not in found
+    assert builder.comparisons.profiles(board)["good"].fraction[-1] == 1.0
+    header, rows = rows_of(section(render(builder, results), "Differences between methods"))
+    assert rows["Good"][header.index("Elsewhere")] == ""
+
+
 # Numbers ------------------------------------------------------------------------------------
 
 
@@ -293,6 +306,7 @@ def test_a_runaway_counts(builder):
         ({"hashes": {"metrics": "other"}}, "scored by different versions of the metrics"),
         ({"versions": {"python": "3.12", "numpy": "1.26"}}, "different versions of numpy"),
         ({"preset": "full"}, "of different presets: full, standard"),
+        ({"preset": "smoke"}, "26 of the 52 records are of a trial, the smoke preset"),
         ({"hardware": {"cpu": "mill"}}, "on different processors"),
     ],
 )
@@ -340,7 +354,7 @@ def test_records_of_a_method_that_do_not_compare_are_warned_of(builder, label, p
         assert "records of Good were made" not in text
     else:
         assert message in text.split("\n## ")[0]
-        assert "new (3 cells), none (23 cells)" in text
+        assert "23 cells by none, 3 cells by new" in text
 
 
 @pytest.mark.parametrize(
@@ -549,6 +563,24 @@ def test_labels_of_a_scatter_do_not_overlap():
     boxes = [Text.get_window_extent(text, renderer) for text in texts]  # without lines to points
     for i, one in enumerate(boxes):
         assert not any(one.overlaps(other) for other in boxes[i + 1 :])
+
+
+def test_labels_of_a_scatter_do_not_cross_its_dashed_line():
+    """A name right of its point would be crossed by the line, one left of it not."""
+    styles = method_styles({name: (name, "none") for name in ("behavioural cloning", "other")})
+    points = [Point("behavioural cloning", 4.8, 50.0), Point("other", 9.0, 90.0)]
+    figure = scatter_figure(
+        points, styles, x_label="x", y_label="y", references={"between demonstrations": 5.0}
+    )
+    (ax,) = figure.axes
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    boxes = {t.get_text(): Text.get_window_extent(t, renderer) for t in ax.texts}
+    (line,) = [one for one in ax.lines if one.get_linestyle() == "--"]
+    label = boxes["behavioural cloning"]
+    assert not label.overlaps(line.get_window_extent(renderer))
+    assert not label.overlaps(boxes["between demonstrations"])
 
 
 def test_scores_that_cannot_be_drawn_are_counted():

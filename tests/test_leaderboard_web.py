@@ -4,6 +4,7 @@ import json
 import math
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from iflow_gym.datasets.lasa import SINGLE_MOTIONS
 from iflow_gym.figures import Point as FigurePoint
 from iflow_gym.figures import method_styles, scatter_figure
 from iflow_gym.system import Guarantee
+
+ROOT = Path(__file__).parents[1]
 
 VOID = {"meta", "link", "input", "img", "br", "path", "use"}
 
@@ -161,6 +164,43 @@ def test_the_cards_say_what_the_table_says(builder, tmp_path):
     assert values[0] == ("Most accurate", "Good")
     assert values[1] == ("Stable for sure", "Safe")
     assert "Slow 25.00 %" in text  # of its starts converged
+
+
+def test_incomplete_methods_are_no_part_of_the_cards_comparison_and_are_named(builder, tmp_path):
+    """Means over other cells do not compare: that of a few easy ones is no better."""
+    results = sweep("good", 2.0) + sweep("bad", 3.0) + sweep("easy", 1.0, shapes=SINGLE_MOTIONS[:3])
+    text = page_of(builder, results, tmp_path)
+    (card,) = re.findall(r"<h3>Most accurate</h3>(.*?)</section>", text)
+    assert card.startswith('<p class="value">Good</p>')
+    assert "over 26 of 26 cells" in card
+    assert "Next: Bad, " in card
+    assert "Good is the better one with 100 % probability" in card
+    assert "Not compared here, since incomplete: Easy (3 of 26)." in card
+    assert "of what was run: Easy 3 of 26 cells" in text
+
+
+def test_a_trial_says_so_when_it_is_opened(builder, tmp_path):
+    text = page_of(builder, sweep("good", preset="smoke"), tmp_path)
+    assert "<h1>iflow-gym leaderboard, a trial</h1>" in text
+    above = text.split('<main id="boards">')[0]
+    assert '<p class="notice" role="note">This is a trial: all its records are of the' in above
+    assert "trial" not in page_of(builder, sweep("good"), tmp_path)
+
+
+def test_a_board_of_few_motions_says_which_figures_it_has_not(builder, tmp_path):
+    results = sweep("good", shapes=SINGLE_MOTIONS[:1])
+    text = page_of(builder, results, tmp_path)
+    assert "are drawn of 4 motions or more; of this family 1 was run." in text
+    (board,) = builder.make_boards(results)
+    assert {"profile", "boxes"}.isdisjoint(builder.web.number_figures(board))
+    assert "motions or more" not in page_of(builder, sweep("good"), tmp_path)
+
+
+def test_documents_are_linked_from_a_page_outside_the_checkout(builder, tmp_path):
+    (link,) = re.findall(
+        r'href="([^"]+)">How to add your method', page_of(builder, sweep("good"), tmp_path)
+    )
+    assert (tmp_path / link).resolve() == ROOT / "docs" / "adding-a-method.md"
 
 
 def test_references_and_clocks_are_set_apart(builder, tmp_path):

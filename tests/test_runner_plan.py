@@ -112,6 +112,38 @@ def test_a_module_without_the_class_and_a_class_that_is_no_method_are_refused():
         load_method("iflow_gym.system:Guarantee")
 
 
+@pytest.mark.parametrize("name", ["mine", "mine.py", "./mine.py", "mine.py:Toy"])
+def test_a_file_in_place_of_a_class_is_told_how_the_class_is_named(
+    make_toy, tmp_path, monkeypatch, name
+):
+    make_toy("mine")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UnknownNameError, match=r"as module:Class, got '.*': mine:Toy\."):
+        plan.select_entries([name], "smoke")
+    with pytest.raises(UnknownNameError, match="such as my_module:MyMethod"):
+        plan.select_entries(["mein"], "smoke")
+
+
+@pytest.mark.parametrize(
+    ("imports", "message"),
+    [
+        ("def broken(:", r"a SyntaxError in .*broken\.py, line 6: invalid syntax"),
+        ("1 / 0", r"ZeroDivisionError in .*broken\.py, line 6: division by zero"),
+    ],
+)
+def test_a_module_that_cannot_be_imported_is_told_by_its_line(make_toy, imports, message):
+    with pytest.raises(UnknownNameError, match=message):
+        plan.select_entries([make_toy("broken", imports=imports)], "smoke")
+
+
+def test_a_guarantee_without_a_reason_is_refused_before_anything_runs(make_toy):
+    text = TOY.replace('"linear"', '""')
+    with pytest.raises(UnknownNameError, match=r"guarantee of silent:Toy: Expected the reason"):
+        plan.select_entries([make_toy("silent", text=text)], "smoke")
+    learned = TOY.replace('"linear"', 'f"rate {{self.rate_}}"')  # known after `fit` alone
+    assert plan.select_entries([make_toy("learned", text=learned)], "smoke")
+
+
 def test_environments_are_chosen_by_globs_over_ids_and_short_names():
     assert len(plan.select_environments(["LASA-*"])) == 30
     assert plan.select_environments(["iflow/LASA-Angle-v0", "LASA-Ang*"]) == ["iflow/LASA-Angle-v0"]
@@ -297,7 +329,10 @@ def test_a_method_has_cells_where_it_learns_the_motion_and_the_rest_is_counted()
     assert found["seds"] == {environments[0]}
     assert found["orbit-field"] == set(environments[1:])
     assert found["dmp"] == found["replay"] == set(environments)
-    assert plan.not_learned(entries, environments) == {"seds": 2, "orbit-field": 1}
+    assert plan.not_learned(entries, environments) == {
+        "seds": "2 (Letter-I-v0, Drumming-v0)",
+        "orbit-field": "1 (LASA-Angle-v0)",
+    }
 
 
 def test_another_suite_beside_it_changes_no_batch():

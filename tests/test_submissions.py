@@ -14,14 +14,16 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from leaderboard_records import sweep
 from rich.console import Console
 
 from iflow_gym.baselines.registry import METHODS, REFERENCES
 from iflow_gym.baselines.run_all import RunOptions, run_all
 from iflow_gym.baselines.runner.plan import task_of
+from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
 from iflow_gym.leaderboard import __main__ as command
 from iflow_gym.leaderboard import rescoring
-from iflow_gym.leaderboard.check import check
+from iflow_gym.leaderboard.check import Report, check, note_extent
 from iflow_gym.leaderboard.compare import changes
 from iflow_gym.leaderboard.rescoring import ACROSS, SAME, differences_of_scores
 from iflow_gym.leaderboard.submission import SubmissionError, read_submission
@@ -225,7 +227,8 @@ def refused(folder, **settings):
 
 def test_a_true_claim_passes_and_its_scores_are_made_again(results):
     report = check(results / "true", seed=0, trust=True)
-    assert [f.verdict for f in report.findings] == ["ok", "ok", "ok"]
+    assert [f.verdict for f in report.findings] == ["ok", "ok", "note", "ok"]
+    assert "1 of 1 are of the smoke preset" in report.findings[2].text
     assert "the same to 1e-06 (same versions)" in report.findings[-1].text
     assert report.status == 0
 
@@ -273,6 +276,27 @@ def test_a_claim_that_the_model_does_not_make_is_refused(submission):
     assert refused(submission) == []
     (text,) = refused(submission, n_cells=1)
     assert "the model claims 'proved', its record 'sampled'" in text
+
+
+def test_how_much_of_a_family_is_there_is_noted(tmp_path):
+    report = Report(tmp_path, 0)
+    results = sweep("good", shapes=SINGLE_MOTIONS[:3]) + sweep("good", shapes=MULTI_MODELS)
+    note_extent(report, results)
+    (finding,) = report.findings
+    text = "of LASA-26, 3 of 26 environments: the row will be incomplete"
+    assert (finding.verdict, finding.text) == ("note", text)
+
+
+def test_failed_cells_alone_are_refused(submission):
+    old = read_result(only_record(submission))
+    failed = dataclasses.replace(
+        old, status="failed", reason="no", metrics={}, medians={}, per_demonstration={},
+        likelihoods={}, fit={}, guarantee=None, model=None, dt=None,
+    )  # fmt: skip
+    for path in [only_record(submission), *submission.glob("*.safetensors")]:
+        path.unlink()
+    write_result(submission.parent, failed)
+    assert refused(submission) == ["records: expected scores, got failed cells alone"]
 
 
 # Scores -----------------------------------------------------------------------------------

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
+import traceback
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -47,6 +49,9 @@ BATCH_SIZE = 15
 have the same to do, and what a failure in a batch costs stays bounded. Training rounds differently
 in another company, which scores show, so that batches depend on the selected environments alone:
 not on the number of workers, nor on what is up to date."""
+
+MOST_NAMED = 6
+"""Environments that a message names one by one."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +138,12 @@ def select_entries(patterns: Sequence[str], preset: str) -> list[Entry]:
             continue
         found = [n for n in (*METHODS, *REFERENCES) if fnmatchcase(n, pattern)]
         if not found:
-            raise unknown("method", pattern, (*METHODS, *REFERENCES))
+            if Path(pattern).is_file() or Path(f"{pattern}.py").is_file():
+                raise _no_class(pattern)
+            error = unknown("method", pattern, (*METHODS, *REFERENCES))
+            raise UnknownNameError(
+                f"{error} A class of your own is named module:Class, such as my_module:MyMethod."
+            )
         names |= dict.fromkeys(found)
     entries = [_reference(n) if n in REFERENCES else _method(n, preset) for n in names]
     taken = METHODS | REFERENCES
@@ -144,6 +154,55 @@ def select_entries(patterns: Sequence[str], preset: str) -> list[Entry]:
                 f"from {other}: give your class another `name`."
             )
     return entries
+
+
+def _no_class(name: str) -> UnknownNameError:
+    """Return the error for a file, or a class in a file, in place of ``module:Class``."""
+    file, _, class_name = name.partition(":")
+    path = Path(file if file.endswith(".py") else f"{file}.py")
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    classes = [class_name] if class_name else re.findall(r"^class (\w+)\(", text, re.MULTILINE)
+    means = " or ".join(f"{path.stem}:{c}" for c in classes) or f"{path.stem}:ITS_CLASS"
+    folder = "" if path.parent == Path() else f", from its folder {path.parent} or with PYTHONPATH"
+    return UnknownNameError(
+        f"Expected a method's name or a class as module:Class, got {name!r}: {means}{folder}."
+    )
+
+
+def _load(name: str) -> type[Method]:
+    """Return a method's class; what goes wrong as its module is imported is told by its line."""
+    file = name.partition(":")[0]
+    if file.endswith(".py") or "/" in file:
+        raise _no_class(name)
+    try:
+        return load_method(name)
+    except SyntaxError as error:
+        raise UnknownNameError(
+            f"Expected {name} to be importable, got a {type(error).__name__} in {error.filename}, "
+            f"line {error.lineno}: {error.msg}."
+        ) from error
+    except UnknownNameError:
+        raise
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        frame = next((f for f in reversed(frames) if f.name == "<module>"), frames[-1])
+        raise UnknownNameError(
+            f"Expected {name} to be importable, got {type(error).__name__} in {frame.filename}, "
+            f"line {frame.lineno}: {error}"
+        ) from error
+
+
+def _check_guarantee(name: str, system: Method) -> None:
+    """Refuse a guarantee that is none already before `fit`, as where its reason is empty.
+
+    One that needs what `fit` learns is looked at with the scores.
+    """
+    try:
+        _ = system.guarantee
+    except ValueError as error:
+        raise UnknownNameError(f"The guarantee of {name}: {error}") from error
+    except Exception:
+        return
 
 
 def _reference(name: str) -> Entry:
@@ -168,7 +227,7 @@ def _reference(name: str) -> Entry:
 
 
 def _method(name: str, preset: str) -> Entry:
-    method = load_method(name)
+    method = _load(name)
     registered = name in METHODS
     if registered and method.name != name:
         raise UnknownNameError(
@@ -177,9 +236,11 @@ def _method(name: str, preset: str) -> Entry:
         )
     settings = load_settings(name, preset, registered=registered)
     try:
-        config = method(**settings).config
+        system = method(**settings)
     except (TypeError, ValueError) as error:
         raise PresetError(f"Settings of {name} in preset [{preset}]: {error}") from error
+    if not registered:
+        _check_guarantee(name, system)
     code = method_code(METHODS.get(name, name).partition(":")[0])
     return Entry(
         name=method.name,
@@ -189,7 +250,7 @@ def _method(name: str, preset: str) -> Entry:
         stochastic=method.stochastic_fit,
         batched=method._fit_many is not Method._fit_many,
         settings=settings,
-        config=json.loads(json.dumps(dataclasses.asdict(config), default=str)),
+        config=json.loads(json.dumps(dataclasses.asdict(system.config), default=str)),
         integrator=method.integrator,
         uses_time=method.uses_time,
         motions=_motions(method),
@@ -309,16 +370,18 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
     return cells
 
 
-def not_learned(entries: Iterable[Entry], environments: Sequence[str]) -> dict[str, int]:
-    """Return by method's name on how many environments it has no cells, where there are any.
+def not_learned(entries: Iterable[Entry], environments: Sequence[str]) -> dict[str, str]:
+    """Return by method's name how many environments it has no cells on and which, where any.
 
-    Their motions are of a kind that it does not learn.
+    Their motions are of a kind that it does not learn. As ``"2 (Letter-A-v0, Letter-B-v0)"``.
     """
-    counts = {
-        entry.name: sum(motion_of(task_of(e)) not in entry.motions for e in environments)
-        for entry in entries
-    }
-    return {name: count for name, count in counts.items() if count}
+    found = {}
+    for entry in entries:
+        names = [short_name(e) for e in environments if motion_of(task_of(e)) not in entry.motions]
+        if names:
+            more = ["..."] if len(names) > MOST_NAMED else []
+            found[entry.name] = f"{len(names)} ({', '.join(names[:MOST_NAMED] + more)})"
+    return found
 
 
 def is_up_to_date(cell: Cell, folder: Path) -> bool:

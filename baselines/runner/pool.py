@@ -21,7 +21,7 @@ from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoo
 from iflow_gym.baselines.runner.plan import Cell, Job
 from iflow_gym.baselines.runner.scoring import THREADS, failed_result
 from iflow_gym.baselines.runner.store import store, sweep
-from iflow_gym.baselines.runner.work import Journal, prepare_worker, run_job
+from iflow_gym.baselines.runner.work import Journal, out_of_time, prepare_worker, run_job
 
 Event = dict[str, Any]
 
@@ -171,7 +171,8 @@ class Pool:
             return job.one_by_one()
         for cell in job.cells:
             if str(cell.path) == killed.path:
-                self._fail(cell, f"exceeded its time limit of {killed.limit:g} s (and was killed)")
+                doing = "it was fitted or scored (and was killed)"
+                self._fail(cell, out_of_time(killed.limit, doing))
         rest = job.without(self._done)
         return [rest] if rest.cells else []
 

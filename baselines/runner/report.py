@@ -77,7 +77,13 @@ class Reporter:
                 if event["pid"] in self._workers:
                     self._progress.update(self._workers[event["pid"]], visible=False)
             if event["reason"]:
-                self.line(f"{event['label']}: FAILED, {event['reason'].splitlines()[0]}")
+                reason, *frames = event["reason"].splitlines()
+                where = f" (where: {event['path']}, reason)" if frames else ""
+                self.line(f"{event['label']}: FAILED, {reason}{where}")
+            elif infinite := event.get("infinite"):
+                titles = ", ".join(get_metric(name).title for name in infinite)
+                why = "a rollout ran away, or a velocity was nan or infinite"
+                self.line(f"{event['label']}: done, but {titles} infinite: {why}")
             elif self._progress is None:
                 self.line(
                     f"{event['label']}: done in {event['seconds']:.1f} s "

@@ -29,6 +29,7 @@ from iflow_gym.baselines.runner.scoring import (
     scored_reference,
 )
 from iflow_gym.baselines.runner.store import CannotWriteError, no_room, store
+from iflow_gym.metrics import get_metric
 from iflow_gym.partial_fits import PartialFitError
 from iflow_gym.results import Result, read_result, write_result
 
@@ -48,6 +49,14 @@ PARENT_SECONDS = 1.0
 
 class TimeLimitExceededError(BaseException):
     """A cell took too long; no Exception, lest a method's own `except Exception` catches it."""
+
+
+def out_of_time(limit: float, doing: str) -> str:
+    """Say in a record that a cell took too long, at what, and what to do."""
+    return (
+        f"exceeded its time limit of {limit:g} s (of the clock, fit and scoring together) while "
+        f"{doing}; --time-limit SECONDS sets another"
+    )
 
 
 class Journal:
@@ -127,7 +136,16 @@ def run_job(number: int, job: Job, folder: Path, journal: Journal) -> None:
             store(folder, result, model)
         except OSError as error:
             raise CannotWriteError(f"{type(error).__name__}: {error}") from error
-        said = {"label": cell.label, "method": cell.entry.name, "reason": result.reason}
+        said = {
+            "label": cell.label,
+            "method": cell.entry.name,
+            "reason": result.reason,
+            "infinite": [
+                name
+                for name, value in result.metrics.items()
+                if value == math.inf and get_metric(name).family == "accuracy"
+            ],
+        }
         journal.write("done", path=path, **said, **_taken(began))
 
 
@@ -158,7 +176,7 @@ def _fit_together(number: int, job: Job, journal: Journal) -> dict[Path, Fit]:
     except BaseException as error:
         if no_room(error):
             raise CannotWriteError(f"{type(error).__name__}: {error}") from error
-        found, why = {}, _reason(error, limit).splitlines()[0]
+        found, why = {}, _reason(error, limit, "they were fitted").splitlines()[0]
     if why:
         left = n - len(found)
         cells = "1 cell" if left == 1 else f"{left} cells"
@@ -184,26 +202,31 @@ def _attempt(cell: Cell, fitted: Fit | None, scratch: Path) -> Result:
     Whatever: Ctrl-C is the parent's, so that a KeyboardInterrupt here is the method's own.
     """
     model = scratch / cell.path.with_suffix(".safetensors")
+    doing = "it was scored"
     try:
         with _time_limit(cell.time_limit):
             if cell.entry.reference:
                 return scored_reference(cell)
-            return scored(cell, fitted or fit_alone(cell), model)
+            if fitted is None:
+                doing = "it was fitted"
+                fitted = fit_alone(cell)
+                doing = "it was scored"
+            return scored(cell, fitted, model)
     except BaseException as error:
         if no_room(error):
             raise CannotWriteError(f"{type(error).__name__}: {error}") from error
-        return _failed(cell, error)
+        return _failed(cell, error, doing)
 
 
-def _failed(cell: Cell, error: BaseException) -> Result:
+def _failed(cell: Cell, error: BaseException, doing: str = "it was scored") -> Result:
     """Return the record of a cell that failed."""
-    return failed_result(cell, _reason(error, cell.time_limit))
+    return failed_result(cell, _reason(error, cell.time_limit, doing))
 
 
-def _reason(error: BaseException, limit: float) -> str:
+def _reason(error: BaseException, limit: float, doing: str) -> str:
     """Say in a record what went wrong: the exception, and where it came from."""
     if isinstance(error, TimeLimitExceededError):
-        return f"exceeded its time limit of {limit:g} s"
+        return out_of_time(limit, doing)
     try:
         text = str(error)
     except BaseException as second:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 
 from iflow_gym.baselines.registry import METHODS, UnknownNameError
 from iflow_gym.baselines.runner.fingerprint import method_code
+from iflow_gym.baselines.runner.plan import family
 from iflow_gym.leaderboard.contradictions import Contradiction, examine
 from iflow_gym.leaderboard.records import label, read_records, wrong_with
 from iflow_gym.leaderboard.rescoring import (
@@ -20,6 +22,7 @@ from iflow_gym.leaderboard.rescoring import (
     tolerance_for,
 )
 from iflow_gym.leaderboard.submission import Submission, SubmissionError, read_submission
+from iflow_gym.registration import POINT_MASS_ID, registered_ids
 from iflow_gym.results import Result
 
 N_CELLS = 3
@@ -141,9 +144,26 @@ def _check_records(report: Report, submission: Submission | None) -> list[Result
         failed = [result for result in good if not result.ok]
         text = f"{len(records)} whole and plausible, by this suite's metrics, data and evaluation"
         report.add("records", "ok", text)
-        if failed:
+        if len(failed) == len(records):
+            report.add("records", "refused", "expected scores, got failed cells alone")
+        elif failed:
             report.add("records", "note", f"{len(failed)} of them are of cells that failed")
+        note_extent(report, records)
     return [result for result in good if result.ok]
+
+
+def note_extent(report: Report, records: list[Result]) -> None:
+    """Note families that are there in part, and records of the smoke preset."""
+    all_of = Counter(family(i) for i in registered_ids() if i != POINT_MASS_ID)
+    came = Counter(f for f, _ in {(r.family, r.environment) for r in records})
+    for name, n in sorted(came.items()):
+        if n < all_of[name]:
+            text = f"of {name}, {n} of {all_of[name]} environments: the row will be incomplete"
+            report.add("records", "note", text)
+    if n_smoke := sum(result.preset == "smoke" for result in records):
+        text = f"{n_smoke} of {len(records)} are of the smoke preset, which is a trial: run the "
+        text += "standard preset with --force"
+        report.add("records", "note", text)
 
 
 def _check_again(report: Report, records: list[Result], n_cells: int, *, trust: bool) -> None:
