@@ -13,7 +13,6 @@ from iflow_gym.baselines.imitation_flow import (
     ConditionalImitationFlow,
     ImitationFlow,
     guard,
-    training,
 )
 from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.guard import TrainingError
