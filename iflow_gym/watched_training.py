@@ -44,7 +44,7 @@ def training_steps(method: Method, demonstrations: Demonstrations) -> int | None
     """Return the steps for which `fit` trains an ImitationFlow; None for any other method."""
     # Of a package that nobody has imported, seconds of torch, the method is none.
     package = sys.modules.get("iflow_gym.baselines.imitation_flow")
-    if package is None or not isinstance(method, package.ImitationFlow):
+    if package is None or type(method) is not package.ImitationFlow:
         return None
     resolved = method.config.resolved(
         cyclic=demonstrations.period is not None, n_dims=demonstrations.n_dims

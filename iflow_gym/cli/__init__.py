@@ -51,19 +51,19 @@ def run(arguments: list[str]) -> int:
 
     if getattr(sys, "stderr", None) is None:  # closed by who called: 2>&-
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (until the end)
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # for --method my_module:MyMethod
     command: Command | None = None
-    if arguments == ["--version"]:
-        from iflow_gym import __version__
-
-        print(f"iflow-gym {__version__}")
-        return 0
     try:
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())  # for --method my_module:MyMethod
         from iflow_gym.cli.commands import parse  # here: an interrupt meets it, too
 
         if getattr(sys, "stdout", None) is None:
             raise UsageError("Expected a standard output, got a closed one: > /dev/null drops it.")
+        if arguments == ["--version"]:
+            from iflow_gym import __version__
+
+            print(f"iflow-gym {__version__}", flush=True)
+            return 0
         command = parse(arguments, DESCRIPTION)
         status = command.run()
         sys.stdout.flush()

@@ -127,6 +127,11 @@ def check_output(path: str, *inputs: str, suffix: str = "") -> None:
     elif not path or target.is_dir():
         came = "a folder" if path else "an empty name"
         raise UsageError(f"Expected a file to write at {path!r}, got {came}.")
+    elif target.exists() and not target.is_file():
+        raise UsageError(
+            f"Expected a file to write at {path!r}, got a device or a pipe: it would be replaced "
+            "by a file, - writes standard output."
+        )
     elif not target.parent.is_dir():
         raise UsageError(
             f"Expected a folder at {target.parent} to write {target.name} into, got none: make it."

@@ -114,7 +114,9 @@ def _add_metadata(path: Path, method: Method, record: dict[str, Any] | None) -> 
     for key, value in said.items():
         if value is not None:
             model.metadata_props.add(key=key, value=json.dumps(value))
-    path.write_bytes(model.SerializeToString())
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_bytes(model.SerializeToString())
+    partial.replace(path)
 
 
 def _checked(method: Any, path: Path) -> float | None:

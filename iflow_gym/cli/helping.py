@@ -33,11 +33,18 @@ def field_texts(cls: type[Any]) -> dict[str, str]:
     return texts
 
 
+_told: set[type[Any]] = set()
+"""Classes whose annotations have their texts."""
+
+
 def say_in_help(cls: type[Any]) -> None:
     """Give tyro the fields' texts as paragraphs: it takes indented lines for ones of their own.
 
     Defaults that are nothing are left out: the texts say what they mean.
     """
+    if cls in _told:
+        return
+    _told.add(cls)
     hints = get_type_hints(cls, include_extras=True)
     texts = field_texts(cls)
     for field in dataclasses.fields(cls):

@@ -79,7 +79,8 @@ class Import:
             raise UsageError("Expected one thing for standard output, got several.")
         if self.sources.count(PIPE) > 1:
             raise UsageError("Expected standard input (-) once among the sources, got it again.")
-        again = [s for i, s in enumerate(self.sources) if s in self.sources[:i] and s != PIPE]
+        files = [Path(s).resolve() for s in self.sources if s != PIPE]
+        again = [str(f.name) for i, f in enumerate(files) if f in files[:i]]
         if again:
             raise UsageError(
                 f"Expected each file of recordings once, got {again[0]} again: every demonstration "

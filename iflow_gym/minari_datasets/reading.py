@@ -67,14 +67,12 @@ def read_minari(
     chosen = _chosen(episodes, dataset.total_episodes)
     if indices is None and key is None and "n_dims" in said:
         indices = range(said["n_dims"])
-    with damage_told(dataset_id):
-        played = [
-            episode.observations
-            for episode in dataset.iterate_episodes(
-                [int(dataset.episode_indices[i]) for i in chosen]
-            )
-        ]
-    positions = [_positions(observations, key, indices) for observations in played]
+    played = iter(dataset.iterate_episodes([int(dataset.episode_indices[i]) for i in chosen]))
+    positions = []
+    for _ in chosen:  # one by one: an episode may hold pictures
+        with damage_told(dataset_id):
+            observations = next(played).observations
+        positions.append(_positions(observations, key, indices))
     if goal is None and period is None:
         goal, period = said.get("goal"), said.get("period")
     return Demonstrations.from_arrays(

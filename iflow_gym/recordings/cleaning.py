@@ -203,7 +203,8 @@ def _cleaned(
 
     recording = noted(steps.in_order(recording, chosen.bad_times))
     if chosen.split is None:
-        steps.check_gaps(recording)
+        with np.errstate(over="ignore"):  # what is too large is told below
+            steps.check_gaps(recording)
     recording = noted(steps.without_gaps(recording, chosen.missing))
     if len(recording) < LEAST_SAMPLES:
         raise RecordingError(

@@ -440,7 +440,8 @@ def _known(column: str, names: Sequence[str], where: str) -> str:
 
 def _doubt(unit: str | None, recordings: Sequence[RawRecording]) -> str:
     """Return a word on times that are taken for seconds and hardly are."""
-    apart = [float(np.median(np.abs(np.diff(r.times)))) for r in recordings if len(r) > 1]
+    known = [r.times[np.isfinite(r.times)] for r in recordings]
+    apart = [float(np.median(np.abs(np.diff(times)))) for times in known if len(times) > 1]
     if unit is not None or not apart or min(apart) < SLOW:
         return ""
     return (

@@ -78,7 +78,8 @@ def cleaning_figure(cleaned: Cleaned) -> Figure:
 def _box(cleaned: Cleaned) -> tuple[FloatArray, FloatArray]:
     """Return the lower and the upper corner of what is drawn, with a margin."""
     points = np.concatenate([r.positions for r in (*cleaned.before, *cleaned.after)])
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.06 * float((high - low).max())
     return low - margin, high + margin
 

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from iflow_gym import Demonstrations
 from iflow_gym.baselines.imitation_flow import training
 from iflow_gym.baselines.imitation_flow.config import ImitationFlowConfig
 from iflow_gym.baselines.imitation_flow.data import Task
 from iflow_gym.baselines.imitation_flow.passes import evaluate
-from iflow_gym.baselines.imitation_flow.whole_step import AHEAD
+from iflow_gym.baselines.imitation_flow.whole_step import AHEAD, by_hand
 from iflow_gym.datasets.lasa import load_lasa
+from iflow_gym.datasets.letters import load_letter
 
 SHAPES = ("Angle", "Sshape", "BendedLine")
 TRAINED = 30
@@ -103,6 +105,51 @@ def test_each_model_trains_as_alone() -> None:
         torch.testing.assert_close(many.narrow(axis, 0, 1), one, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("settings", [{"calm_weight": 0.0}, {"emission": "spline"}])
+def test_a_model_that_is_lost_leaves_the_others_as_they_are() -> None:
+    """Bit by bit, whatever its parameters have become; it is taken back."""
+    disturbed, undisturbed = batch_of(3), batch_of(3)
+    adams = [batch.optimizer(60, 0.003) for batch in (disturbed, undisturbed)]
+    for step in range(60):
+        if step == 30:
+            for parameter, axis in disturbed.parameters:
+                parameter.data.select(axis, 1).fill_(torch.nan)
+        for batch, adam in zip((disturbed, undisturbed), adams, strict=True):
+            batch.step(adam, step, training.WHOLE)
+    assert [len(r) for r in adams[0].restarts] == [0, 1, 0]
+    for (one, axis), (other, _) in zip(disturbed.parameters, undisturbed.parameters, strict=True):
+        for model in (0, 2):
+            assert torch.equal(one.select(axis, model), other.select(axis, model))
+        assert one.isfinite().all()
+
+
+def test_more_than_a_group_come_back_in_their_order() -> None:
+    n = training.GROUP + 1
+    config = ImitationFlowConfig(n_layers=2, n_steps=2, calm_speed=1e6)
+    motions = [load_lasa(SHAPES[i % 3]) for i in range(n)]
+    rngs = [np.random.default_rng(i) for i in range(n)]
+    found = training.train(config, [Task([motion]) for motion in motions], rngs)
+    last = training.train_one(config, Task([motions[-1]]), np.random.default_rng(n - 1))
+    assert len(found) == n
+    model = found[-1]
+    assert isinstance(model, training.Trained)
+    for name, array in model.arrays().items():
+        np.testing.assert_allclose(array, last.arrays()[name], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"calm_weight": 0.0}, {"emission": "spline"}, {"objective": "paper"}]
+)
 def test_other_settings_train_in_torch(settings: dict) -> None:
     assert batch_of(1, **settings)._whole is None
+
+
+def test_other_motions_and_devices_train_in_torch() -> None:
+    config, cpu = ImitationFlowConfig(), torch.device("cpu")
+    ends = Task([load_lasa("Angle")])
+    assert by_hand(config, ends, cpu)
+    assert not by_hand(config, ends, torch.device("cuda"))
+    assert not by_hand(config, Task([load_letter("S")]), cpu)
+    assert not by_hand(config, Task([load_lasa("Angle")], np.zeros((1, 1))), cpu)
+    line = np.linspace(1, 0, 20)[:, None] * np.ones(3)
+    space = Demonstrations.from_arrays([line, line * 1.1], dt=0.1, name="line")
+    assert not by_hand(config, Task([space]), cpu)

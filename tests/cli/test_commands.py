@@ -185,7 +185,8 @@ def test_completion_knows_the_commands(call):
         (["export", "linear.safetensors", "-o", "a.onnx"], "imitation-flow"),
         (["score", "-", "-"], "one of the inputs"),
         (["import", "reach.csv", "-o", "reach.csv"], "which is one of them"),
-        (["import", "reach.csv", "reach.csv", "-o", "a"], "reach.csv again"),
+        (["import", "reach.csv", "./reach.csv", "-o", "a"], "reach.csv again"),
+        (["import", "reach.csv", "-o", os.devnull], "a device or a pipe"),
         (["import", "reach.csv", "-o", "a", "--plot", "a.gif"], ".png"),
         (["import", "reach.csv", "-o", "a", "--format", "xyz"], "csv, npz"),
         (["import", "reach.csv", "-o", "mine.csv"], "such as mine.safetensors"),
@@ -566,3 +567,14 @@ def test_closed_and_full_streams_are_told(folder, line, status, said):
     assert (done.returncode, done.stdout) == (status, b"")
     assert said in done.stderr
     assert b"Traceback" not in done.stderr
+
+
+def test_infinite_cells_are_missing_in_the_picture_too(call, folder):
+    rows = [f"{0.01 * i},{1 - 0.01 * i},{(1 - 0.01 * i) ** 2}" for i in range(101)]
+    rows[3], rows[5] = "0.03,inf,1.0", ",0.95,0.9"
+    (folder / "gappy.csv").write_text("t,x,y\n" + "\n".join(rows) + "\n")
+    status, _, said = call("import", "gappy.csv", "-o", "gappy.safetensors", "--plot", "gappy.png")
+    assert status == 0, said
+    assert "dropped 2" in said
+    assert "nan" not in said
+    assert (folder / "gappy.png").stat().st_size > 1000
