@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from iflow_gym.datasets.drums import DRUMS, LEFT, RIGHT, TIP_RADIUS
@@ -53,6 +53,7 @@ def test_deep_inside_a_command_leads_out_the_nearer_way():
 
 
 @given(point=vector, velocity=vector)
+@example(point=np.array([0.0, 0.0, -0.5]), velocity=np.zeros(3))  # on the axis
 def test_no_command_leads_deeper_in_than_the_distance_allows(point, velocity):
     point = point + RIGHT.head
     dt = 0.01
