@@ -6,8 +6,9 @@ A change that moves them changes what the id means: bump its -vN, then write the
 
 A rollout replays half of a demonstration (two strokes) and goes on with random actions, pushed
 with a force. On one machine all of it is the same bits, which `rollout_hash` is of. Another
-processor rounds other sums, and no digit would be safe to hash: what is kept are the tip's positions
-every `EVERY` steps, to be met within `TOLERANCE`. MuJoCo's arithmetic may change from version to version, so the file says which one it is for.
+processor rounds other sums, and no digit would be safe to hash: what is kept are the tip's
+positions every `EVERY` steps, to be met within `TOLERANCE`. MuJoCo's arithmetic may change from
+version to version, so the file says which one it is for.
 """
 
 from __future__ import annotations
