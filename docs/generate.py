@@ -405,7 +405,7 @@ def results() -> str:
         "frechet": "Fréchet (mm)",
         "dtw": "DTW / sample (mm)",
         "converged": "converged",
-        "fit_seconds": "fit (s a shape)",
+        "fit_cpu_seconds": "fit (CPU s a shape)",
     }
     text = ""
     for protocol in PROTOCOLS:
