@@ -300,6 +300,8 @@ def performance_profile(
             (_weights(rng, n_resamples, len(r)) @ r for r in reached),
             start=np.zeros((n_resamples, len(at))),
         ) / len(reached)
+    # Shares, whose sums some processors round to a little more than 1.
+    draws = np.round(draws, 12)
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
     fraction = each.mean(axis=0)
     if resampled == "nothing":

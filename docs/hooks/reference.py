@@ -89,6 +89,7 @@ INNER = {
     "iflow_gym.envs.nearest",
     "iflow_gym.envs.rendering",
     "iflow_gym.residual.composition",
+    "iflow_gym.watched_training",
 }
 """Modules that nobody needs but those who change the package."""
 
