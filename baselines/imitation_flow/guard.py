@@ -97,7 +97,9 @@ def one_cycle(peak: float, n_steps: int) -> list[tuple[float, float]]:
 class Adam:
     """Adam's moments of an array (Kingma and Ba, "Adam", 2015), and its step in place.
 
-    A dozen small operations: torch's own takes longer to find out what it is given.
+    A dozen small operations: torch's own takes longer to find out what it is given. The first decay
+    changes from step to step, so the mean is divided by 1 less the product of all decays so far;
+    torch's takes a power of the present one.
     """
 
     def __init__(self, parameters: Tensor) -> None:

@@ -1,9 +1,10 @@
 """A chain of affine coupling layers and its gradients, written once for NumPy and for torch.
 
-Arrays are (..., d, n) with the points last; the layers' weights lead with the layer. A few models
-on a CPU run in NumPy, one after the other: these are thousands of operations on a few kilobytes
-each, which torch takes several times as long to start. Many models, and a GPU, run in torch as a
-batch. The functions are the same, `xp` is the library.
+Arrays are (..., d, n) with the points last; the layers' weights lead with the layer. On a CPU a few
+models run in NumPy, together in `whole_step` and one after the other under `coupling`: these are
+thousands of operations on a few kilobytes each, which torch takes several times as long to start.
+Many models under `coupling`, and a GPU, run in torch as a batch. The functions are the same, `xp`
+is the library.
 
 Weights are R (layers, ..., d, d), W1 (layers, ..., h + 1, seen + 1) and W2 (layers, ..., 2 moved,
 h + 1). Biases are the weights of an input that is 1 and of a unit that is 1: its argument is
@@ -120,7 +121,10 @@ class Memory:
         self._kept: dict[Any, Any] = {}
 
     def take(self, key: tuple[str, Array], make: Callable[[], Any]) -> Any:
-        """Return what was made for a key's name and shape before, or make it."""
+        """Return what was made for a key's name and shape before, or make it.
+
+        A memory belongs to one `Weights`: the key does not say whose arrays they are.
+        """
         name, like = key
         known = name, tuple(like.shape)
         if known not in self._kept:

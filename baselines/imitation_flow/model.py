@@ -79,7 +79,7 @@ class ImitationFlow(DynamicalSystem):
     L|z|^2 = 2 z^T A z + tr(K K^T) is positive close to the attractor. With ``noise="vanishing"`` it
     does. `guarantee` speaks of the mean.
 
-    `fit_many` trains motions of like counts and dimensions in one batch, each from its own seed.
+    `fit_many` trains motions of like counts and dimensions in batches, each from its own seed.
     What trains beside a motion changes the rounding of its sums and nothing else, but training
     amplifies rounding: after a full training a fit is as good and not bit for bit the one alone.
     Where some diverge the others are trained to the end, and `fit_many` raises a `PartialFitError`

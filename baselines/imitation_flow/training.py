@@ -1,4 +1,4 @@
-"""Training many ImitationFlows as one batched model.
+"""Training many ImitationFlows as batched models.
 
 Positions are relative to the goal, in one unit of length a motion (`data.Frame`); times are divided
 by the mean duration of the motion's recordings. The objectives are those of

@@ -129,8 +129,8 @@ def check_output(path: str, *inputs: str, suffix: str = "") -> None:
         raise UsageError(f"Expected a file to write at {path!r}, got {came}.")
     elif target.exists() and not target.is_file():
         raise UsageError(
-            f"Expected a file to write at {path!r}, got a device or a pipe: it would be replaced "
-            "by a file, - writes standard output."
+            f"Expected a file to write at {path!r}, got a device or a pipe, which a file would "
+            "replace: - writes standard output."
         )
     elif not target.parent.is_dir():
         raise UsageError(
