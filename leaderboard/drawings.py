@@ -314,17 +314,17 @@ def accuracy_stability(board: Board, styles: Mapping[str, MethodStyle], unit: st
 
 
 def accuracy_fit_time(board: Board, styles: Mapping[str, MethodStyle], unit: str) -> Figure:
-    """Time to fit against the main accuracy."""
+    """CPU time of a fit against the main accuracy: the clock of a busy machine says little."""
     metric = MAIN[board.motion]
     points = []
     for row in _drawn(board, styles):
-        x, y = row.aggregate("fit_seconds"), row.aggregate(metric)
+        x, y = row.aggregate("fit_cpu_seconds"), row.aggregate(metric)
         if x is not None and y is not None:
             points.append(Point(row.method, x.iqm, y.iqm, x.iqm_interval, y.iqm_interval))
     return scatter_figure(
         points,
         styles,
-        x_label="time to fit a motion (s), interquartile mean",
+        x_label="CPU time to fit a motion (s), interquartile mean",
         y_label=f"{_axis(metric, unit)}, interquartile mean",
         x_log=True,
         y_log=_is_error(metric),

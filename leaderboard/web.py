@@ -66,7 +66,7 @@ SHOWN_FIRST: dict[Motion, tuple[str, ...]] = {
         "rmse",
         "converged",
         "perturbation_recovery",
-        "fit_seconds",
+        "fit_cpu_seconds",
         "step_us",
     ),
     "cycle": (
@@ -74,7 +74,7 @@ SHOWN_FIRST: dict[Motion, tuple[str, ...]] = {
         "period_error",
         "attraction",
         "perturbation_recovery",
-        "fit_seconds",
+        "fit_cpu_seconds",
         "step_us",
     ),
     "drumming": (
@@ -82,7 +82,7 @@ SHOWN_FIRST: dict[Motion, tuple[str, ...]] = {
         "hit_f1",
         "attraction",
         "perturbation_recovery",
-        "fit_seconds",
+        "fit_cpu_seconds",
         "step_us",
     ),
 }
@@ -424,18 +424,18 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
         {"label": "Most accurate", "value": first.title, "text": text, "beside": beside},
         proved_card(board, found),
     ]
-    fit, step = found[first.method, "fit_seconds"], found[first.method, "step_us"]
+    fit, step = found[first.method, "fit_cpu_seconds"], found[first.method, "step_us"]
     if fit is not None and step is not None:
-        cost = f"{shown('fit_seconds', fit.iqm)} s to fit a motion"
+        cost = f"{shown('fit_cpu_seconds', fit.iqm)} s of CPU to fit a motion"
         beside = f"For {first.title}; a step takes {shown('step_us', step.iqm)} µs."
         quick = [
             (a.iqm, row.title)
             for row in board.fullest
-            if (a := found[row.method, "fit_seconds"]) is not None
+            if (a := found[row.method, "fit_cpu_seconds"]) is not None
         ]
         if quick and min(quick)[1] != first.title:
             seconds, name = min(quick)
-            beside += f" Quickest: {name}, {shown('fit_seconds', seconds)} s."
+            beside += f" Quickest: {name}, {shown('fit_cpu_seconds', seconds)} s."
         result.append({"label": "Its cost", "value": cost, "text": beside, "beside": ""})
     return result
 
