@@ -60,7 +60,8 @@ class KeepOut:
                 if velocity[2] < least:
                     velocity = np.array([velocity[0], velocity[1], least])
             elif above < 0.0:
-                out = np.array([across / r, along / r, 0.0])
+                # On the axis every way out is as short.
+                out = np.array([across / r, along / r, 0.0] if r else [1.0, 0.0, 0.0])
                 least, towards = -beside / BRAKING_TIME, float(out @ velocity)
                 if towards < least:
                     velocity = velocity + (least - towards) * out

@@ -16,8 +16,6 @@ WALL = RIGHT.radius + RIM + TIP_RADIUS
 OVER = np.array([RIGHT.head[0] + 0.02, RIGHT.head[1], FACE])
 coordinate = st.floats(-0.5, 0.5)
 vector = st.tuples(coordinate, coordinate, coordinate).map(np.array)
-beside_the_axis = vector.filter(lambda v: np.hypot(v[0], v[1]) > 1e-12)
-"""Of a drum; on it, deep inside, there is no way out that is the shortest."""
 
 
 def depth(point):
@@ -54,7 +52,13 @@ def test_deep_inside_a_command_leads_out_the_nearer_way():
     assert pressed[0] == 0.1
 
 
-@given(point=beside_the_axis, velocity=vector)
+def test_on_the_axis_deep_inside_any_way_out_will_do():
+    inside = RIGHT.head - np.array([0.0, 0.0, WALL + 0.1])
+    out = KeepOut((RIGHT,)).slid(inside, np.zeros(3))
+    assert np.hypot(*out[:2]) == pytest.approx(WALL / BRAKING_TIME)
+
+
+@given(point=vector, velocity=vector)
 def test_no_command_leads_deeper_in_than_the_distance_allows(point, velocity):
     point = point + RIGHT.head
     dt = 0.01
@@ -63,7 +67,7 @@ def test_no_command_leads_deeper_in_than_the_distance_allows(point, velocity):
     assert depth(moved) <= max(depth(point), 0.0) + 1e-12 or depth(point) > 0
 
 
-@given(point=beside_the_axis, velocity=vector)
+@given(point=vector, velocity=vector)
 def test_nothing_but_a_climb_is_added_to_a_command_outside(point, velocity):
     point = point + RIGHT.head
     if depth(point) <= 0:
