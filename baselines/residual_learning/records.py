@@ -38,7 +38,7 @@ from iflow_gym.baselines.runner.plan import entry_points, family
 from iflow_gym.evaluate import evaluate, motion_of
 from iflow_gym.metrics import metrics_hash, metrics_of
 from iflow_gym.residual.policy import ResidualPolicy, Zero
-from iflow_gym.residual.shield import RATE_SHARE
+from iflow_gym.residual.shield import RATE_SHARE, SLACK
 from iflow_gym.results import Result, check_metrics, read_result, result_path, write_result
 from iflow_gym.system import Guarantee
 
@@ -83,6 +83,11 @@ class Row:
             falls = (
                 f"outside a tube of {TUBE:.0%} of the latent radius round the cycle {falls}; "
                 "inside V stays below the tube's level"
+            )
+        elif not velocity_mode:
+            plant += (
+                f" The agent has no say while V, measured, is above {SLACK:g} exp(-rho t / 2) of "
+                "its start's."
             )
         return Guarantee(
             "proved",

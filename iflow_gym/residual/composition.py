@@ -107,13 +107,27 @@ class Composition:
         d = self.n_dims
         return np.asarray(features[:, :d] * self._half[:d] + self._centre[:d])
 
+    def allowance(
+        self, observations: FloatArray, dt: FloatArray, before: FloatArray | None, begun: BoolArray
+    ) -> FloatArray | None:
+        """Return the shield's W for `commanded`, (n,), from that of the step before; see there."""
+        if self.shield is None:
+            return None
+        return self.shield.allowance(observations[:, : self.n_dims], dt, before, begun)
+
     def commanded(
-        self, observations: FloatArray, command: FloatArray, actions: FloatArray, dt: FloatArray
+        self,
+        observations: FloatArray,
+        command: FloatArray,
+        actions: FloatArray,
+        dt: FloatArray,
+        allowance: FloatArray | None = None,
     ) -> FloatArray:
         """Return u, shape (n, d), for the base's `command` and the agent's actions, (n, d) each."""
         added = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0) * self.largest
         if self.shield is not None:
-            added = self.shield.kept(observations[:, : self.n_dims], command, added, dt)
+            x = observations[:, : self.n_dims]
+            added = self.shield.kept(x, command, added, dt, allowance)
         return np.asarray(command + added)
 
     def checked(self, actions: Any, shape: tuple[int, ...]) -> FloatArray:

@@ -16,6 +16,8 @@ class Memory(NamedTuple):
 
     base: Any
     agent: Any
+    allowance: FloatArray | None
+    """The shield's W."""
 
 
 class ResidualPolicy:
@@ -101,7 +103,7 @@ class BoundResidualPolicy:
         states = values[None] if single else values
         n = len(states)
         dt = np.broadcast_to(np.asarray(own.task.dt, dtype=np.float64), n)
-        memory = Memory(None, None) if state is None else state
+        memory = Memory(None, None, None) if state is None else state
         begun = starts_of(n, state is None)
         if episode_start is not None:
             begun = begun | np.asarray(episode_start, dtype=bool)
@@ -109,13 +111,14 @@ class BoundResidualPolicy:
         features = own.features(states, command)
         if not np.isfinite(features).all():  # a base that ran away: the judge is to see it
             action = np.full((n, own.n_dims), np.nan)
-            return (action[0] if single else action), Memory(base, memory.agent)
+            return (action[0] if single else action), Memory(base, memory.agent, memory.allowance)
         residual, agent = self._agent.predict(
             features, state=memory.agent, episode_start=begun, deterministic=deterministic
         )
-        total = own.commanded(states, command, np.asarray(residual), dt)
+        allowance = own.allowance(states, dt, memory.allowance, begun)
+        total = own.commanded(states, command, np.asarray(residual), dt, allowance)
         action = own.task.command_to_action(total, states, dt)
-        return (action[0] if single else action), Memory(base, agent)
+        return (action[0] if single else action), Memory(base, agent, allowance)
 
 
 class Zero:

@@ -79,6 +79,7 @@ class ResidualActionWrapper(
         self._command: FloatArray = np.zeros((1, self.composition.n_dims))
         self._dt: FloatArray = np.zeros(1)
         self._memory: Any = None
+        self._allowance: FloatArray | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -86,7 +87,7 @@ class ResidualActionWrapper(
         """Begin an episode; options are the environment's."""
         observation: Any
         observation, info = self.env.reset(seed=seed, options=options)
-        self._memory = None
+        self._memory = self._allowance = None
         seen = self._see(observation, info, begun=True)
         return seen, {**info, **_commands(self._command[0], self._command[0])}
 
@@ -98,7 +99,7 @@ class ResidualActionWrapper(
             raise gymnasium.error.ResetNeeded("Call reset() before step().")
         added = self.composition.checked(action, (self.composition.n_dims,))
         base, state, dt = self._command, self._observation, self._dt
-        command = self.composition.commanded(state[None], base, added[None], dt)
+        command = self.composition.commanded(state[None], base, added[None], dt, self._allowance)
         own = self.composition.task.command_to_action(command[0], state, float(dt[0]))
         following: Any
         following, reward, terminated, truncated, info = self.env.step(own)
@@ -112,6 +113,9 @@ class ResidualActionWrapper(
         states = self._observation[None]
         self._command, self._memory = self.composition.base.command(
             states, self._dt, self._memory, starts_of(1, begun)
+        )
+        self._allowance = self.composition.allowance(
+            states, self._dt, self._allowance, starts_of(1, begun)
         )
         seen: Features = self.composition.features(states, self._command)[0]
         return seen
@@ -151,6 +155,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
         self._command: FloatArray = np.zeros((self.num_envs, self.composition.n_dims))
         self._dt: FloatArray = np.zeros(self.num_envs)
         self._memory: Any = None
+        self._allowance: FloatArray | None = None
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -161,6 +166,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
         if mask is None or self._observation is None:
             begun = starts_of(self.num_envs, True)
             self._memory, self._dt = None, np.asarray(info["dt"], dtype=np.float64).copy()
+            self._allowance = None
         else:
             begun = np.asarray(mask)
             self._dt = np.where(begun, info["dt"], self._dt)
@@ -168,9 +174,11 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
         if mask is None or self._memory is None:
             seen = self._see(observations, begun)
         else:  # the clocks of those that go on have been asked for this step already
-            kept, memory = self._command, self._memory
+            kept, memory, allowance = self._command, self._memory, self._allowance
             seen = self._see(observations, begun)
             self._command = np.asarray(np.where(begun[:, None], self._command, kept))
+            if allowance is not None:
+                self._allowance = np.where(begun, self._allowance, allowance)
             self._memory = _merged(memory, self._memory, begun)
             states = np.asarray(observations, dtype=np.float64)
             seen = self.composition.features(states, self._command)
@@ -185,7 +193,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
         n = self.num_envs
         added = self.composition.checked(actions, (n, self.composition.n_dims))
         base, states, dt = self._command, self._observation, self._dt
-        command = self.composition.commanded(states, base, added, dt)
+        command = self.composition.commanded(states, base, added, dt, self._allowance)
         own = self.composition.task.command_to_action(command, states, dt)
         observations, rewards, terminated, truncated, info = self.env.step(own)
         ended = np.asarray(terminated) | np.asarray(truncated)
@@ -199,6 +207,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
         self._observation = np.asarray(observations, dtype=np.float64)
         self._command, self._memory = self.composition.base.command(
             self._observation, self._dt, self._memory, begun
+        )
+        self._allowance = self.composition.allowance(
+            self._observation, self._dt, self._allowance, begun
         )
         return self.composition.features(self._observation, self._command)
 
