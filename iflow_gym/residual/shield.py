@@ -74,7 +74,6 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from iflow_gym.demonstrations import FloatArray

@@ -177,7 +177,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Features, FloatArray,
             kept, memory, allowance = self._command, self._memory, self._allowance
             seen = self._see(observations, begun)
             self._command = np.asarray(np.where(begun[:, None], self._command, kept))
-            if allowance is not None:
+            if allowance is not None and self._allowance is not None:
                 self._allowance = np.where(begun, self._allowance, allowance)
             self._memory = _merged(memory, self._memory, begun)
             states = np.asarray(observations, dtype=np.float64)
