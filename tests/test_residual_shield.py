@@ -20,7 +20,7 @@ from iflow_gym.registration import POINT_MASS_ID
 from iflow_gym.residual import LyapunovShield, ResidualActionWrapper, ResidualPolicy
 from iflow_gym.residual.composition import Composition, lyapunov_of
 from iflow_gym.residual.policy import Hostile, Zero
-from iflow_gym.residual.shield import projected, within_speed
+from iflow_gym.residual.shield import SLACK, projected, within_speed
 
 finite = st.floats(-3, 3, allow_nan=False).map(lambda v: round(v, 3))
 
@@ -255,3 +255,72 @@ def test_evaluation_of_the_base_alone_is_that_of_the_base(angle):
     theirs = evaluate(angle, env, seed=0, stability=False).per_demonstration
     for name in ("rmse", "frechet", "dtw", "swept_area"):
         assert ours[name] == theirs[name]
+
+
+# A plant that does not follow ---------------------------------------------------------------
+
+
+def test_an_agent_has_no_say_where_the_plant_does_not_follow(angle):
+    """A mass too heavy to move: V stays, and after ln(S) / (rho / 2) the base is alone."""
+    envs = gymnasium.make_vec(
+        "iflow/Disturbed-Angle-v0", 3, "vector_entry_point", mass_ratio=1e9, horizon=10**6
+    )
+    wrapped = ResidualActionWrapper(envs, angle, scale=0.1, stable=True)
+    shield = wrapped.composition.shield
+    until = np.log(SLACK) / (shield.rate / 2)
+    wrapped.reset(seed=0)
+    value = shield.lyapunov.value
+    first, dt = value(positions(wrapped)), envs.unwrapped.dt
+    n_steps = int(1.5 * np.max(until / dt))
+    may = np.empty((n_steps, 3), dtype=bool)
+    said = np.empty_like(may)
+    for k in range(n_steps):
+        may[k] = value(positions(wrapped)) <= SLACK * np.exp(-shield.rate / 2 * k * dt) * first
+        said[k] = heard(wrapped)
+    np.testing.assert_array_equal(said, may)
+    assert said[20].all()
+    assert not said[-1].any()
+    wrapped.reset(options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(heard(wrapped), [False, True, False])
+
+
+def positions(wrapped):
+    return np.stack(wrapped.env.unwrapped._state, axis=-1)[:, :2]
+
+
+def heard(wrapped):
+    """Where an action that the projection lets through is kept, in a step."""
+    inward = -np.sign(wrapped.composition.shield.lyapunov.value_and_gradient(positions(wrapped))[1])
+    _, _, _, _, info = wrapped.step(inward)
+    return (info["command"] != info["base_command"]).any(axis=1)
+
+
+@given(data=st.data())
+@settings(max_examples=20, deadline=None)
+def test_where_commands_are_carried_out_the_measured_v_never_silences_an_agent(data, angle):
+    """Without a speed limit that slows the base."""
+    lyapunov = FlowLyapunov(angle)
+    task = gymnasium.make("iflow/LASA-Angle-v0").unwrapped
+    shield = LyapunovShield(lyapunov, 1e3 * task.max_speed)
+    policy = DynamicalSystemPolicy(angle, max_speed=1e3 * task.max_speed, dt=1.0)
+    box, rng = (
+        task.demonstrations.bounding_box,
+        np.random.default_rng(data.draw(st.integers(0, 99))),
+    )
+    x = rng.uniform(box.low - box.diagonal / 2, box.high + box.diagonal / 2, (20, 2))
+    dt = np.full(20, 5 * task.demonstrations.mean_dt)
+    allowance, begun = None, np.ones(20, dtype=bool)
+    for _ in range(20):
+        allowance = shield.allowance(x, dt, allowance, begun)
+        begun = ~begun & False
+        assert (lyapunov.value(x) <= allowance).all()
+        c, r = policy.command(x, dt), rng.normal(size=(20, 2)) * task.max_speed
+        kept = shield.kept(x, c, r, dt, allowance)
+        np.testing.assert_array_equal(kept, shield.kept(x, c, r, dt))
+        x = x + dt[:, None] * (c + kept)
+
+
+def test_an_agent_of_a_motion_that_repeats_is_never_silenced(letter):
+    shield = LyapunovShield(FlowLyapunov(letter), 1.0)
+    x, begun = np.ones((2, 2)), np.array([True, False])
+    assert np.isinf(shield.allowance(x, np.ones(2), None, begun)).all()
