@@ -9,6 +9,7 @@ from typing import get_args
 from board import MAIN, RANKED, Board, motion_of
 from classes import confusion, fraction_right
 from comparisons import compared, improvements, rank_comparison
+from records import origin
 from tables import (
     BY_MEAN,
     Aggregates,
@@ -27,6 +28,7 @@ from tables import (
 )
 
 from iflow_gym.baselines.registry import METHODS, REFERENCES
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.metrics import METRICS, Motion, get_metric, metrics_hash, metrics_of
 from iflow_gym.results import Result
 from iflow_gym.statistics import Improvement, RankComparison
@@ -69,6 +71,9 @@ MEMORY = (
     "a batch's is shared by its cells."
 )
 """What `peak_memory_mb` of a record is."""
+
+NOTE_LENGTH = 200
+"""Characters of the longest note on a method that is in the page."""
 
 HEADLINE = "LASA-26"
 """The family that the figures of all methods are of."""
@@ -303,6 +308,7 @@ def render(
     results: Sequence[Result],
     figures: Mapping[str, str],
     units: Mapping[str, str],
+    submissions: Mapping[str, Submission],
 ) -> str:
     """Return the page.
 
@@ -316,6 +322,8 @@ def render(
         Name to path relative to the page, of the figures that were drawn.
     units
         Family to its unit of length.
+    submissions
+        What methods' folders say of them, by the methods' names.
     """
     page = ["# Leaderboard", ""]
     page += [
@@ -350,6 +358,7 @@ def render(
     page += shapes_section(boards)
     page += failures(boards)
     page += about(results, boards, units)
+    page += origins(submissions)
     return "\n".join(page).rstrip() + "\n"
 
 
@@ -592,6 +601,22 @@ def about(
     definitions = [[m.title, m.unit, m.better, escaped(m.definition)] for m in METRICS]
     page += table(["Metric", "Unit", "Better", "Definition"], definitions)
     return [*page, "</details>", ""]
+
+
+def origins(submissions: Mapping[str, Submission]) -> list[str]:
+    """Return where each method comes from, folded; long notes are in index.html alone."""
+    if not submissions:
+        return []
+    page = ["<details><summary>Where each method comes from</summary>", ""]
+    for one in sorted(submissions.values(), key=lambda one: one.title.lower()):
+        said = []
+        for term, text, *address in origin(one):
+            if term == "Note" and len(text) > NOTE_LENGTH:
+                continue
+            words = f"[{escaped(text)}](<{address[0]}>)" if address else escaped(text)
+            said.append(f"{term.lower()}: {words.rstrip('.')}")
+        page.append(f"- **{escaped(one.title)}**, {'; '.join(said)}.")
+    return [*page, "", "</details>", ""]
 
 
 def _times(results: Sequence[Result]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from board import Board, Row
 from tables import heading, shape_name, shown
 
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.metrics import Metric, metrics_of
 from iflow_gym.results import Result
 from iflow_gym.statistics import mean_intervals
@@ -19,14 +20,17 @@ SETTING_LENGTH = 200
 """Characters of a setting that are shown."""
 
 
-def details(board: Board, row: Row, length_unit: str) -> dict[str, Any]:
-    """Return what is known of a row, in words, for JSON."""
+def details(
+    board: Board, row: Row, length_unit: str, submission: Submission | None = None
+) -> dict[str, Any]:
+    """Return what is known of a row, in words, for JSON; a fact's third entry is its address."""
     cells = [row.cells[key] for key in sorted(row.cells)]
     metrics = [m for m in metrics_of(board.motion) if row.applies(m.name)]
     scores = motion_scores(board, row, metrics)
     return {
         "facts": [
             ["Method", f"{row.title} ({row.method})"],
+            *origin(submission),
             ["Class", _listed(cell.target for cell in cells)],
             ["Seeds", ", ".join(map(str, row.seeds))],
             ["Cells with scores", row.coverage],
@@ -42,6 +46,27 @@ def details(board: Board, row: Row, length_unit: str) -> dict[str, Any]:
         "metrics": [heading(m.name, length_unit) for m in metrics],
         "scores": scores,
     }
+
+
+def origin(submission: Submission | None) -> list[list[str]]:
+    """Return paper, code and note of a method, each with its address where it has one."""
+    if submission is None:
+        return []
+    paper, link = submission.paper, address(submission.link)
+    found = []
+    if paper != "none":
+        found.append(["Paper", paper, link])
+    elif link:
+        found.append(["Paper", link, link])
+    found.append(["Code", submission.code, address(submission.code)])
+    if submission.note is not None:
+        found.append(["Note", submission.note, ""])
+    return [entry if entry[2] else entry[:2] for entry in found]
+
+
+def address(text: str | None) -> str:
+    """Return text that may be a link's address, of the web; else nothing."""
+    return text if text is not None and text.startswith(("https://", "http://")) else ""
 
 
 def motion_scores(board: Board, row: Row, metrics: Sequence[Metric]) -> list[list[Any]]:

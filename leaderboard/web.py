@@ -51,6 +51,7 @@ from tables import (
 )
 
 from iflow_gym.figures import PALETTE
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.metrics import METRICS, Motion, get_metric, metrics_of
 from iflow_gym.results import Result
 
@@ -124,6 +125,7 @@ def render(
     *,
     drawings: Mapping[str, Drawing],
     figures: Mapping[str, Figure],
+    submissions: Mapping[str, Submission],
 ) -> str:
     """Return the page.
 
@@ -140,6 +142,8 @@ def render(
     drawings, figures
         The sheets and what was drawn of them, whose panels make the gallery; without figures the
         page has no pictures at all, and is quick to make.
+    submissions
+        What methods' folders say of them, by the methods' names.
     """
     pictures = bool(figures) or not drawings
     styles = Styles()
@@ -148,7 +152,9 @@ def render(
     for board in boards:
         unit = units.get(board.family, "length")
         key = identifier(f"{board.family}-{board.protocol}")
-        data[key] = {row.method: details(board, row, unit) for row in board.rows}
+        data[key] = {
+            row.method: details(board, row, unit, submissions.get(row.method)) for row in board.rows
+        }
         families.setdefault(board.family, []).append(
             board_context(board, unit, key, drawings, figures, styles if pictures else None)
         )

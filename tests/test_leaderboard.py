@@ -21,6 +21,7 @@ from iflow_gym.figures import (
     save_figure,
     scatter_figure,
 )
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.metrics import metrics_hash
 from iflow_gym.plotting import GOAL
 from iflow_gym.results import write_result
@@ -33,8 +34,9 @@ def boards_of(builder, results):
     return builder.make_boards(results)
 
 
-def render(builder, results):
-    return builder.render(boards_of(builder, results), results, {}, {"LASA-26": "mm"})
+def render(builder, results, **submissions):
+    boards = boards_of(builder, results)
+    return builder.render(boards, results, {}, {"LASA-26": "mm"}, submissions)
 
 
 def section(text, title, level="### "):
@@ -394,6 +396,26 @@ def test_titles_and_reasons_cannot_break_the_page(builder):
     assert f"| {clean} | " in text
 
 
+def test_where_a_method_comes_from_is_said_and_a_long_note_is_not(builder):
+    said = {"name": "good", "title": "Good", "guarantee": "none", "hardware": "abacus"}
+    one = Submission(
+        **said,
+        paper="A. [B], *C*",
+        code="https://x.org/a(b)",
+        link="https://x.org/p",
+        note="Short.",
+    )
+    other = Submission(**said | {"title": "Bad"}, paper="none", code="a/b_c.py", note="x" * 201)
+    text = render(builder, sweep("good") + sweep("bad", 2.0), good=one, bad=other)
+    lines = text[text.index("Where each method comes from") :].splitlines()[2:4]
+    assert lines == [
+        "- **Bad**, code: a/b\\_c.py.",
+        "- **Good**, paper: [A. \\[B\\], \\*C\\*](<https://x.org/p>); "
+        "code: [https://x.org/a(b)](<https://x.org/a(b)>); note: Short.",
+    ]
+    assert "Where each method comes from" not in render(builder, sweep("good"))
+
+
 def test_what_memory_is_is_said(builder):
     cost = section(render(builder, sweep("good")), "Cost")
     assert "rise of the worker's resident memory" in cost
@@ -515,6 +537,22 @@ def test_the_script_prints_what_it_wrote(tmp_path):
     assert done.stdout.split() == [
         str(tmp_path / "out" / name) for name in ("LEADERBOARD.md", "index.html")
     ]
+
+
+def test_a_folders_method_toml_is_read_and_a_wrong_one_is_told(builder, tmp_path):
+    folder = tmp_path / "results"
+    write_result(folder, record("good", "Multi_Models_1"))
+    described = folder / "good" / "method.toml"
+    said = 'name = "good"\ntitle = "Good"\npaper = "A paper"\ncode = "https://x.org/code"\n'
+    described.write_text(said + 'guarantee = "none"\nhardware = "abacus"\n')
+    page, html, *_ = builder.build(folder, tmp_path / "out")
+    assert "- **Good**, paper: A paper; code: [https://x.org/code](<" in page.read_text()
+    assert '["Code","https://x.org/code","https://x.org/code"]' in html.read_text()
+    described.write_text(said)
+    done = run_script("--results", folder, "--output", tmp_path / "out")
+    assert done.returncode == 2
+    assert "expected guarantee, got none" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_a_check_finds_what_the_records_do_not_say(builder, tmp_path):

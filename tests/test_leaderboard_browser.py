@@ -29,6 +29,10 @@ def address(builder, tmp_path_factory):
     results += sweep("good", 1.0, protocol="generalisation")
     for result in results:
         write_result(folder / "results", result)
+    (folder / "results" / "good" / "method.toml").write_text(
+        'name = "good"\ntitle = "Good"\npaper = "A paper"\ncode = "a/b.py"\nguarantee = "none"\n'
+        'hardware = "abacus"\nlink = "https://example.org/p?a=1&b=2"\n'
+    )
     builder.build(folder / "results", folder)
     return (folder / "index.html").as_uri()
 
@@ -192,6 +196,17 @@ def test_details(open_page):
     assert not inside.is_visible()
     page.get_by_role("button", name="Good").first.click()
     assert "n_steps" in page.locator("tr.details:visible").inner_text()
+
+
+def test_where_a_method_comes_from(open_page):
+    page = open_page()
+    page.get_by_role("button", name="Good").first.click()
+    inside = page.locator("tr.details:visible")
+    (link,) = inside.get_by_role("link").all()
+    assert link.inner_text() == "A paper"
+    assert link.get_attribute("href") == "https://example.org/p?a=1&b=2"
+    assert link.get_attribute("rel") == "noopener"
+    assert "a/b.py" in inside.inner_text()
 
 
 def test_the_reason_of_a_guarantee(open_page):

@@ -13,6 +13,7 @@ from leaderboard_records import failed, record, sweep
 from iflow_gym.datasets.lasa import SINGLE_MOTIONS
 from iflow_gym.figures import Point as FigurePoint
 from iflow_gym.figures import method_styles, scatter_figure
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.system import Guarantee
 
 ROOT = Path(__file__).parents[1]
@@ -50,10 +51,12 @@ class Page(HTMLParser):
         ]
 
 
-def page_of(builder, results, tmp_path):
+def page_of(builder, results, tmp_path, **submissions):
     boards = builder.make_boards(results)
     units = {board.family: "mm" for board in boards}
-    return builder.web.render(boards, results, units, tmp_path, drawings={"x": None}, figures={})
+    return builder.web.render(
+        boards, results, units, tmp_path, drawings={"x": None}, figures={}, submissions=submissions
+    )
 
 
 def data_of(page):
@@ -124,6 +127,40 @@ def test_nothing_is_fetched(builder, tmp_path):
     assert "default-src 'none'" in policy["content"]
     assert not re.search(r'(?:src|href)="(?!data:|#|\.\./|LEADERBOARD)', text)
     assert not re.search(r"@import|url\((?!#)|fetch\(|XMLHttpRequest|sendBeacon", text)
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        (
+            {"link": "https://x.org/p"},
+            [["Paper", "A & <b>", "https://x.org/p"], ["Code", "a/b.py"]],
+        ),
+        (
+            {"paper": "none", "link": "https://x.org/p", "note": "</script>"},
+            [
+                ["Paper", "https://x.org/p", "https://x.org/p"],
+                ["Code", "a/b.py"],
+                ["Note", "</script>"],
+            ],
+        ),
+        (
+            {"code": "http://x.org", "link": "javascript:alert(1)"},
+            [["Paper", "A & <b>"], ["Code", "http://x.org", "http://x.org"]],
+        ),
+        ({"paper": "none", "code": "data:text/html,x"}, [["Code", "data:text/html,x"]]),
+    ],
+)
+def test_paper_code_and_note_are_in_the_details_and_only_the_webs_addresses_are_links(
+    builder, tmp_path, changes, facts
+):
+    fields = {"name": "good", "title": "Good", "paper": "A & <b>", "code": "a/b.py"}
+    one = Submission(**fields | changes, guarantee="none", hardware="abacus")
+    text = page_of(builder, sweep("good"), tmp_path, good=one)
+    Page(text)
+    known = data_of(text)["LASA-26-reproduction"]["good"]["facts"]
+    assert known[1 : 1 + len(facts)] == facts
+    assert known[1 + len(facts)][0] == "Class"
 
 
 def test_failed_cells_and_cells_never_run_are_in_the_details(builder, tmp_path):

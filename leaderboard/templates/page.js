@@ -200,8 +200,11 @@
   }
   function list(pairs, many = false) {
     const made = element("dl", undefined, { class: many ? "facts many" : "facts" });
-    for (const [term, text] of pairs) {
-      const pair = [element("dt", term), element("dd", text)];
+    for (const [term, text, address] of pairs) {
+      const pair = [element("dt", term), element("dd", address ? undefined : text)];
+      if (address) {
+        pair[1].append(element("a", text, { href: address, target: "_blank", rel: "noopener" }));
+      }
       if (many) {
         const together = element("div");
         together.append(...pair);
