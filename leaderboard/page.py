@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import get_args
 
-from board import MAIN, RANKED, Board, motion_of
+from board import MAIN, RANKED, Board, Row, common_ground, motion_of
 from classes import confusion, fraction_right
-from comparisons import compared, improvements, rank_comparison
+from comparisons import compared, improvements, rank_comparison, ranked
 from records import origin
 from tables import (
     BY_MEAN,
@@ -155,10 +155,29 @@ def footnote(board: Board, found: Aggregates) -> str:
             for row in incomplete
         )
         text += (
-            ". An incomplete row is aggregated over the cells it has, ranks last on the others, "
+            ". An incomplete row is aggregated over the cells it has, ranks last where it failed, "
+            "and competes for the bold value only with rows as full."
         )
-        text += "and competes for the bold value only with rows as full."
-    return text
+    rows, ground = common_ground(board.competitors)
+    if rows and len(ground) < len(board.environments):
+        text += (
+            f" Mean ranks are over {len(ground)} of {len(board.environments)} environments, those "
+            "that all ranked methods were run on."
+        )
+    return text + not_ranked(board.competitors, rows)
+
+
+def not_ranked(rows: Sequence[Row], ranked: Sequence[Row]) -> str:
+    """Say which rows are not ranked, and why, with a space before; nothing where all are."""
+    names = {row.method for row in ranked}
+    left = [
+        f"{escaped(row.title)} (on {len(row.ran)} of {len(row.environments)} environments)"
+        for row in rows
+        if row.method not in names
+    ]
+    if not left:
+        return ""
+    return f" Not ranked, since run on too few of the others' environments: {'; '.join(left)}."
 
 
 def failures(boards: Sequence[Board]) -> list[str]:
@@ -370,7 +389,7 @@ def comparison_section(board: Board, figures: Mapping[str, str]) -> list[str]:
     title = get_metric(MAIN[board.motion]).title
     page = [f"### Differences between methods, by {title}", ""]
     if (comparison := rank_comparison(board)) is not None:
-        page += [ranks_in_words(comparison), "", *_pictures(figures, ("ranks",))]
+        page += [ranks_in_words(board, comparison), "", *_pictures(figures, ("ranks",))]
     rows = compared(board)
     page += [improvement_in_words(found), ""]
     lines = [
@@ -394,15 +413,16 @@ def percent_of(found: Improvement) -> str:
     return text if low == high or "nan" in low else f"{text}<br><sub>{low} to {high}</sub>"
 
 
-def ranks_in_words(comparison: RankComparison) -> str:
+def ranks_in_words(board: Board, comparison: RankComparison) -> str:
     """Say what the tests of ranks say."""
     p = comparison.p_value
     return (
-        f"Friedman's test over {comparison.n_environments} environments, the mean over the seeds "
-        f"in each (seeds are no data sets of their own): chi² = {comparison.statistic:.1f}, "
-        f"p {'< 0.001' if p < 0.001 else f'= {p:.3f}'}. Mean ranks further apart than "
-        f"{comparison.critical_difference:.2f} differ by Nemenyi's test at "
+        f"Friedman's test over the {comparison.n_environments} environments that all its methods "
+        "were run on, the mean over the seeds in each (seeds are no data sets of their own): "
+        f"chi² = {comparison.statistic:.1f}, p {'< 0.001' if p < 0.001 else f'= {p:.3f}'}. Mean "
+        f"ranks further apart than {comparison.critical_difference:.2f} differ by Nemenyi's test at "
         f"{100 * comparison.alpha:.0f} % (Demšar 2006)."
+        f"{not_ranked(compared(board), ranked(board)[0])}"
     )
 
 
@@ -571,7 +591,8 @@ def about(
             f"{KINDS[motion]} over " + ", ".join(get_metric(m).title for m in names)
             for motion, names in RANKED.items()
         )
-        + ", those that apply to every competitor; a cell without scores ranks last.",
+        + ", those that apply to every competitor; a cell that failed ranks last, and "
+        "environments that not all ranked methods were run on are left out.",
         "- **Guarantee**: *proved* by construction for every state, *verified* on a bounded region "
         "with an error bound, *sampled* where it was tried, or *none*. The methods' own "
         "reasons, as given for the first shape:",

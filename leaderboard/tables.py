@@ -247,7 +247,7 @@ def named(row: Row) -> str:
 
 def eligible_methods(board: Board) -> set[str]:
     """Return the competitors that may have the best value: those that cover the most cells."""
-    return board.best(dict.fromkeys((row.method for row in board.competitors), 0.0), "mean_rank")
+    return {row.method for row in board.fullest}
 
 
 def interval(metric: str, ends: Interval, value: str) -> str:
@@ -272,8 +272,10 @@ def rank_of(board: Board, row: Row) -> str:
     """Return a row's mean rank, bold if it is the best; nothing for what does not compete."""
     if not row.competes:
         return ""
+    if row.method not in board.mean_rank:
+        return "–"
     text = f"{board.mean_rank[row.method]:.2f}"
-    return f"**{text}**" if row.method in board.best(board.mean_rank, "mean_rank") else text
+    return f"**{text}**" if row.method in board.first else text
 
 
 def guarantee_of(row: Row) -> str:

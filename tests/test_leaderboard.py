@@ -84,6 +84,63 @@ def test_a_failed_cell_ranks_last_and_stays(builder):
     assert len(board.rows[1].failed) == 20
 
 
+def test_ranks_are_over_what_all_were_run_on(builder):
+    """The worst on six shapes is no better for them, nor worse where it was never run."""
+    results = sweep("good", 2.0) + sweep("late", 1.0, shapes=SINGLE_MOTIONS[6:])
+    results += sweep("bad", 3.0)
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"late": 1.0, "good": 2.0, "bad": 3.0}
+    assert [row.method for row in board.rows] == ["late", "good", "bad"]
+    assert board.first == {"late"}
+    page = render(builder, results)
+    accuracy = section(page, "Accuracy")
+    assert "Mean ranks are over 20 of 26 environments, those that all ranked methods" in accuracy
+    assert "Not ranked" not in page
+    header, rows = rows_of(accuracy)
+    assert rows["Late"][header.index("Mean rank")] == "**1.00**"
+    comparison = builder.comparisons.rank_comparison(board)
+    assert comparison.n_environments == 20
+    assert comparison.mean_ranks == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_a_seed_that_was_never_run_costs_no_rank(builder):
+    results = sweep("good", 1.0) + sweep("good", 1.0, shapes=SINGLE_MOTIONS[:3], seed=1)
+    (board,) = boards_of(builder, results + sweep("bad", 2.0))
+    assert board.mean_rank == {"good": 1.0, "bad": 2.0}
+    results += [failed("good", s, seed=1) for s in SINGLE_MOTIONS[3:]]
+    (board,) = boards_of(builder, results + sweep("bad", 2.0))
+    assert board.mean_rank == pytest.approx({"good": (3 + 23 * 2) / 26, "bad": (6 + 23) / 26})
+
+
+def test_what_was_run_on_too_little_is_not_ranked_and_named(builder):
+    results = sweep("a", 1.0) + sweep("b", 2.0) + sweep("c", 3.0)
+    results += sweep("few", 0.1, shapes=SINGLE_MOTIONS[:12])
+    results += [failed("dead", s) for s in SINGLE_MOTIONS]
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"a": 1.0, "b": 2.0, "c": 3.0, "dead": 4.0}
+    assert [row.method for row in board.rows] == ["a", "b", "c", "dead", "few"]
+    comparison = builder.comparisons.rank_comparison(board)
+    assert comparison.n_environments == 26
+    assert comparison.mean_ranks == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    page = render(builder, results)
+    said = "Not ranked, since run on too few of the others' environments: Few (on 12 of 26 env"
+    assert said in section(page, "Accuracy")
+    assert said in section(page, "Differences between methods")
+    header, rows = rows_of(section(page, "Accuracy"))
+    assert rows["Few"][header.index("Mean rank")] == "–"
+    labels = [t.get_text() for t in builder.drawings.ranks(board).findobj(Text)]
+    assert not [text for text in labels if "Few" in text]
+    assert [text for text in labels if "Dead" in text]
+
+
+def test_methods_that_were_run_elsewhere_cut_nobodys_ranks(builder):
+    """With both halves in it the ranks would be over nothing: the first by name is taken."""
+    results = sweep("all", 2.0) + sweep("early", 1.0, shapes=SINGLE_MOTIONS[:13])
+    results += sweep("late", 1.0, shapes=SINGLE_MOTIONS[13:])
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"early": 1.0, "all": 2.0}
+
+
 def test_a_metric_that_no_field_means_no_last_rank(builder):
     """A policy without a velocity field has no SEDS error; ranks are taken where all have one."""
     blind = [

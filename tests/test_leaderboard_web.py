@@ -216,6 +216,14 @@ def test_incomplete_methods_are_no_part_of_the_cards_comparison_and_are_named(bu
     assert "of what was run: Easy 3 of 26 cells" in text
 
 
+def test_what_is_not_ranked_has_no_rank_and_is_named(builder, tmp_path):
+    results = sweep("good", 2.0) + sweep("bad", 3.0) + sweep("easy", 1.0, shapes=SINGLE_MOTIONS[:3])
+    text = page_of(builder, results, tmp_path)
+    assert row_of(text, "easy")["rank"] == "–"
+    assert row_of(text, "good")["rank"] == "<strong>1.00</strong>"
+    assert "environments: Easy (on 3 of 26 environments)." in text
+
+
 def test_a_trial_says_so_when_it_is_opened(builder, tmp_path):
     text = page_of(builder, sweep("good", preset="smoke"), tmp_path)
     assert "<h1>iflow-gym leaderboard, a trial</h1>" in text
