@@ -9,7 +9,7 @@ from typing import get_args
 from board import MAIN, RANKED, Board, Row, common_ground, motion_of
 from classes import confusion, fraction_right
 from comparisons import compared, improvements, rank_comparison, ranked
-from records import origin
+from records import origin, unscored
 from tables import (
     BY_MEAN,
     Aggregates,
@@ -183,14 +183,11 @@ def not_ranked(rows: Sequence[Row], ranked: Sequence[Row]) -> str:
 def failures(boards: Sequence[Board]) -> list[str]:
     """Return the section of cells that have no scores."""
     lines = [
-        [
-            f"{escaped(row.title)} on {shape_name(cell.environment)}, {board.protocol}, "
-            f"seed {cell.seed}",
-            _one_line(cell.reason or ""),
-        ]
+        [f"{escaped(row.title)} on {group.names}, {board.protocol}", _one_line(group.reason)]
         for board in boards
         for row in board.rows
-        for cell in row.failed
+        for group in unscored(row)
+        if group.reason
     ]
     never = [
         f"- {escaped(row.title)}: {row.n_never_run} of {row.n_expected} cells of {board.family}, "
@@ -208,8 +205,7 @@ def failures(boards: Sequence[Board]) -> list[str]:
 
 
 def _one_line(reason: str) -> str:
-    first = reason.strip().splitlines()[0] if reason.strip() else "no reason given"
-    return escaped(first)
+    return escaped(reason.splitlines()[0])
 
 
 SMOKE = (
@@ -420,8 +416,8 @@ def ranks_in_words(board: Board, comparison: RankComparison) -> str:
         f"Friedman's test over the {comparison.n_environments} environments that all its methods "
         "were run on, the mean over the seeds in each (seeds are no data sets of their own): "
         f"chi² = {comparison.statistic:.1f}, p {'< 0.001' if p < 0.001 else f'= {p:.3f}'}. Mean "
-        f"ranks further apart than {comparison.critical_difference:.2f} differ by Nemenyi's test at "
-        f"{100 * comparison.alpha:.0f} % (Demšar 2006)."
+        f"ranks further apart than {comparison.critical_difference:.2f} differ by Nemenyi's test "
+        f"at {100 * comparison.alpha:.0f} % (Demšar 2006)."
         f"{not_ranked(compared(board), ranked(board)[0])}"
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -226,17 +226,17 @@ def reward_of(row: Row) -> str:
 
 
 def outside(board: Board) -> list[tuple[str, str]]:
-    """Return title and reason of each registered method that cannot learn a board's motions."""
+    """Return which registered methods cannot learn a board's motions, and why: titles, reason."""
     if board.motion == "goal":
         asked = [(load_method(name), "learns_goals") for name in METHODS]
     else:
         asked = [(load_method(name), "learns_cycles") for name in METHODS]
     here = {row.method for row in board.rows}
-    return [
-        (method.title, method.not_learned)
-        for method, attribute in asked
-        if method.name not in here and not getattr(method, attribute)
-    ]
+    titles: dict[str, list[str]] = defaultdict(list)
+    for method, attribute in asked:
+        if method.name not in here and not getattr(method, attribute):
+            titles[method.not_learned].append(method.title)
+    return [(", ".join(names), why) for why, names in titles.items()]
 
 
 def named(row: Row) -> str:

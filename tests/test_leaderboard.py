@@ -22,8 +22,9 @@ from iflow_gym.figures import (
     scatter_figure,
 )
 from iflow_gym.leaderboard.submission import Submission
-from iflow_gym.metrics import metrics_hash
+from iflow_gym.metrics import metrics_hash, metrics_of
 from iflow_gym.plotting import GOAL
+from iflow_gym.registration import lasa_id
 from iflow_gym.results import write_result
 from iflow_gym.system import Guarantee
 
@@ -331,10 +332,37 @@ def test_intervals_say_what_they_resample(builder):
 def test_failed_cells_are_listed_with_their_reasons(builder):
     results = [*sweep("good", shapes=SINGLE_MOTIONS[1:]), failed("good", "Angle")]
     text = render(builder, results)
-    assert "| Good on Angle, reproduction, seed 0 | RuntimeError: it \\| broke |" in text
+    assert "| Good on Angle (seed 0), reproduction | RuntimeError: it \\| broke |" in text
     assert "25 of 26 (1 failed, 0 never run)" in text
     header, rows = rows_of(text[text.index("Fréchet</summary>") :])
     assert rows["Angle"][header.index("Good")] == "failed"
+
+
+def test_cells_that_failed_for_the_same_reason_are_one_line(builder):
+    shapes = SINGLE_MOTIONS[:4]
+    results = sweep("good", shapes=SINGLE_MOTIONS[4:])
+    results += [
+        failed("good", s, reason=f"ValueError: {s} has {i + 0.5} s, e.g. {lasa_id(s)}")
+        for i, s in enumerate(shapes[:3])
+    ]
+    results += [failed("good", shapes[3], reason="ValueError: something else")]
+    text = section(render(builder, results), "Cells without scores", "## ")
+    lines = [line for line in text.splitlines() if line.startswith("| Good")]
+    assert len(lines) == 2
+    assert lines[0].startswith(f"| Good on {', '.join(shapes[:3])} (seed 0), reproduction | Value")
+    assert lines[1].endswith("| ValueError: something else |")
+
+
+def test_methods_that_cannot_learn_a_motion_are_told_by_reason(builder):
+    metrics = {m.name: 1.0 for m in metrics_of("cycle")}
+    results = [
+        record("good", "Angle", metrics=metrics, environment="iflow/Letter-I-v0", family="Letter")
+    ]
+    (board,) = boards_of(builder, results)
+    found = dict(builder.tables.outside(board))
+    assert found["SEDS, CLF-DM, Stable linear"] == "its systems end at a goal"
+    assert len(found) == len(set(found.values()))
+    assert "| SEDS, CLF-DM, Stable linear | not applicable |" in render(builder, results)
 
 
 def test_a_method_that_only_failed_is_still_there(builder):

@@ -184,7 +184,7 @@ def test_details(open_page):
     inside = page.locator(f"#{opener.get_attribute('aria-controls')}")
     text = inside.inner_text()
     assert "RuntimeError: it broke" in text
-    assert f"{SINGLE_MOTIONS[0]}, seed 0" in text
+    assert f"1 cell: {SINGLE_MOTIONS[0]} (seed 0)\nRuntimeError: it broke" in text
     assert "abacus" in text
     assert "numpy 2.0" in text
     assert inside.locator("tbody tr").count() == 26

@@ -107,7 +107,7 @@ def test_nothing_in_a_record_can_break_the_page(builder, tmp_path):
     assert not [a for _, a in page.elements if "onerror" in a]
     assert "<script>alert" not in text
     known = data_of(text)["LASA-26-reproduction"]["good"]
-    assert known["missing"] == [["Angle, seed 0", evil]]
+    assert known["missing"] == [["failed", f"1 cell: Angle (seed 0)\n{evil}"]]
     assert known["guarantees"] == [["none", evil]]
     (badge,) = page.find("button", **{"class": "badge none"})
     assert badge["data-reason"] == evil
@@ -169,13 +169,39 @@ def test_failed_cells_and_cells_never_run_are_in_the_details(builder, tmp_path):
     text = page_of(builder, results, tmp_path)
     known = data_of(text)["LASA-26-reproduction"]["good"]
     assert known["missing"] == [
-        [f"{SINGLE_MOTIONS[0]}, seed 0", "RuntimeError: it broke\nfile.py:1"],
-        [f"{SINGLE_MOTIONS[1]}, seed 0", "never run"],
+        ["failed", f"1 cell: {SINGLE_MOTIONS[0]} (seed 0)\nRuntimeError: it broke\nfile.py:1"],
+        ["never run", f"1 cell: {SINGLE_MOTIONS[1]} (seed 0)"],
     ]
     scores = {line[0]: line[1:] for line in known["scores"]}
     assert scores[SINGLE_MOTIONS[0]] == ["failed"]
-    assert scores[SINGLE_MOTIONS[1]] == ["never run"]
+    assert SINGLE_MOTIONS[1] not in scores
     assert "24 of 26" in row_of(text, "good")["cells"]
+
+
+def test_cells_without_scores_are_a_line_for_each_reason(builder, tmp_path):
+    shapes = SINGLE_MOTIONS
+    results = [r for seed in (0, 1) for r in sweep("good", shapes=shapes[:2], seed=seed)]
+    results += [
+        failed(
+            "good", s, reason=f"ValueError: expected 3 rounds of {s}, got {i}\nfile.py:1", seed=0
+        )
+        for i, s in enumerate(shapes[2:5])
+    ]
+    results += [failed("good", shapes[2], reason="OSError: no", seed=1)]
+    text = page_of(builder, results, tmp_path)
+    known = data_of(text)["LASA-26-reproduction"]["good"]
+    assert known["missing"] == [
+        [
+            "failed",
+            f"3 cells: {', '.join(shapes[2:5])} (seed 0)\nValueError: expected 3 rounds of "
+            f"{shapes[2]}, got 0\nfile.py:1\nThe others' reasons read alike.",
+        ],
+        ["failed", f"1 cell: {shapes[2]} (seed 1)\nOSError: no"],
+        [
+            "never run",
+            f"44 cells: {', '.join(shapes[3:5])} (seed 1); {', '.join(shapes[5:])} (seeds 0, 1)",
+        ],
+    ]
 
 
 def test_intervals_of_a_motion_are_over_demonstrations_or_else_over_seeds(builder, tmp_path):

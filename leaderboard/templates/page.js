@@ -238,7 +238,7 @@
     if (known.missing.length) made.append(list(known.missing));
     else made.append(element("p", "None: every cell has scores."));
     if (known.settings.length) made.append(element("h4", "Settings"), list(known.settings, true));
-    made.append(element("h4", "Every motion"));
+    made.append(element("h4", "Every motion that was run"));
     made.append(element("p",
       "Means over the seeds. Below: 95 % bootstrap interval over the demonstrations; of what has " +
       "one number a cell, the least and the greatest of the seeds.", { class: "footnote" }));
