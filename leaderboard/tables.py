@@ -44,6 +44,9 @@ Aggregates = dict[tuple[str, str], "Aggregate | None"]
 # Numbers ------------------------------------------------------------------------------------
 
 
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def number(value: float | None) -> str:
     """Return three significant digits, "∞" for a runaway, "≈ 0" for rounding, "–" for nothing."""
     if value is None or math.isnan(value):
@@ -54,8 +57,11 @@ def number(value: float | None) -> str:
         return "0"
     if abs(value) < ROUNDING:
         return "≈ 0"
-    if abs(value) < 1e-3 or abs(value) >= 1e6:
-        return f"{value:.1e}"
+    if 1e-4 <= abs(value) < 1e-3:
+        return f"{value:.2g}"
+    if abs(value) < 1e-4 or abs(value) >= 1e6:
+        digits, _, power = f"{value:.1e}".partition("e")
+        return f"{digits}·10{str(int(power)).translate(SUPERSCRIPTS)}"
     if value == int(value):
         return f"{value:.0f}"
     decimals = max(0, 2 - math.floor(math.log10(abs(value))))
@@ -76,8 +82,16 @@ def percent(value: float | None) -> str:
 
 
 def shown(metric: str, value: float | None) -> str:
-    """Return a value as its metric is shown."""
+    """Return a value as its metric is shown: in percent, or below a millisecond with that unit."""
+    if value is not None and get_metric(metric).unit == "s" and ROUNDING <= value < 1e-3:
+        return f"{number(1e3 * value)} ms" if value >= 1e-4 else f"{number(1e6 * value)} µs"
     return percent(value) if metric in PERCENT else number(value)
+
+
+def with_unit(metric: str, value: float) -> str:
+    """Return a value as it is shown, with its metric's unit unless that is said already."""
+    text = shown(metric, value)
+    return text if text.endswith("s") else f"{text} {get_metric(metric).unit}"
 
 
 def heading(metric: str, length_unit: str) -> str:

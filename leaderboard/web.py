@@ -48,6 +48,7 @@ from tables import (
     shape_name,
     shown,
     statistic_of,
+    with_unit,
 )
 
 from iflow_gym.figures import PALETTE
@@ -428,8 +429,8 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
     ]
     fit, step = found[first.method, "fit_cpu_seconds"], found[first.method, "step_us"]
     if fit is not None and step is not None:
-        cost = f"{shown('fit_cpu_seconds', fit.iqm)} s of CPU to fit a motion"
-        beside = f"For {first.title}; a step takes {shown('step_us', step.iqm)} µs."
+        cost = f"{with_unit('fit_cpu_seconds', fit.iqm)} of CPU to fit a motion"
+        beside = f"For {first.title}; a step takes {with_unit('step_us', step.iqm)}."
         quick = [
             (a.iqm, row.title)
             for row in board.fullest
@@ -437,7 +438,7 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
         ]
         if quick and min(quick)[1] != first.title:
             seconds, name = min(quick)
-            beside += f" Quickest: {name}, {shown('fit_cpu_seconds', seconds)} s."
+            beside += f" Quickest: {name}, {with_unit('fit_cpu_seconds', seconds)}."
         result.append({"label": "Its cost", "value": cost, "text": beside, "beside": ""})
     return result
 

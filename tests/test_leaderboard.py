@@ -278,12 +278,31 @@ def test_a_cell_that_was_never_run_is_no_defeat(builder):
     ("value", "text"),
     [
         (2.1549, "2.15"), (0.0266, "0.0266"), (134.2, "134"), (8.0, "8"), (0.0, "0"),
-        (12345.6, "12346"), (1.5e7, "1.5e+07"), (2e-5, "2.0e-05"), (2e-14, "≈ 0"), (math.inf, "∞"),
+        (12345.6, "12346"), (1.5e7, "1.5·10⁷"), (2e-5, "2.0·10⁻⁵"), (-3.4e-4, "-0.00034"),
+        (9.96e-4, "0.001"), (2e-14, "≈ 0"), (math.inf, "∞"),
         (math.nan, "–"), (None, "–"),
     ],
 )  # fmt: skip
 def test_numbers(builder, value, text):
     assert builder.tables.shown("rmse", value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text", "with_unit"),
+    [
+        (3.4e-4, "0.340 ms", "0.340 ms"), (2.52e-5, "25.2 µs", "25.2 µs"),
+        (4.25e-6, "4.25 µs", "4.25 µs"),
+        (0.00822, "0.00822", "0.00822 s"), (12.5, "12.5", "12.5 s"), (0.0, "0", "0 s"),
+    ],
+)  # fmt: skip
+def test_seconds(builder, value, text, with_unit):
+    assert builder.tables.shown("fit_seconds", value) == text
+    assert builder.tables.with_unit("fit_seconds", value) == with_unit
+
+
+def test_other_units_are_said_once(builder):
+    assert builder.tables.with_unit("step_us", 3.25) == "3.25 µs"
+    assert builder.tables.shown("rmse", 3.4e-4) == "0.00034"
 
 
 @pytest.mark.parametrize(

@@ -237,6 +237,39 @@ def test_it_can_be_read_in_either_colours_at_any_width(open_page, scheme, width)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+def test_what_is_wider_than_a_phone_says_that_it_scrolls(open_page):
+    page = open_page(viewport={"width": 390, "height": 800})
+    page.get_by_role("button", name="Good").first.click()
+    areas = page.locator(".scroll:visible")
+    assert areas.count() >= 5
+    for area in areas.all():
+        assert area.get_attribute("tabindex") == "0"
+        assert area.get_attribute("role") == "region"
+        assert area.get_attribute("aria-label")
+    table = page.get_by_role("region", name="Scores, LASA-26, reproduction")
+    line = table.locator("xpath=preceding-sibling::*[1]")
+    figure = page.get_by_role("region", name="Figure: Every motion's scores")
+    inside = page.get_by_role("region", name="Every motion's scores", exact=True)
+    for area in (table, figure, inside):
+        above = area.locator("xpath=preceding-sibling::*[1]")
+        above.wait_for()
+        assert above.inner_text() == "Scroll sideways for the rest →"
+        assert "gradient" in area.evaluate("area => getComputedStyle(area).maskImage")
+    page.locator("select[name=time]").focus()
+    page.keyboard.press("Tab")
+    assert table.evaluate("area => getComputedStyle(area).outlineStyle") == "solid"
+    assert table.evaluate("area => getComputedStyle(area).maskImage") == "none"  # nor the outline
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("area => area.scrollLeft > 0", arg=table.element_handle())
+    table.evaluate("area => { area.scrollLeft = area.scrollWidth; }")
+    page.wait_for_function("area => !area.classList.contains('more')", arg=table.element_handle())
+    assert line.is_visible()  # there is more on the other side
+    page.set_viewport_size({"width": 1600, "height": 800})
+    line.wait_for(state="hidden")
+    assert not figure.locator("xpath=preceding-sibling::*[1]").is_visible()
+    assert "more" not in figure.get_attribute("class")
+
+
 def test_colours_by_the_button(open_page):
     page = open_page(color_scheme="light")
     page.get_by_role("button", name="Dark colours").click()

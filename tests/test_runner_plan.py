@@ -15,7 +15,7 @@ import pytest
 
 from iflow_gym.baselines import registry
 from iflow_gym.baselines.registry import METHODS, UnknownNameError, load_method
-from iflow_gym.baselines.runner import fingerprint, plan, presets
+from iflow_gym.baselines.runner import fingerprint, plan, presets, report
 from iflow_gym.baselines.runner.fingerprint import method_code
 from iflow_gym.baselines.runner.presets import (
     PRESETS,
@@ -340,6 +340,14 @@ def test_a_trials_record_is_done_again_by_another_preset(
     metrics = {metric.name: 0.5 for metric in metrics_of("goal")}
     write_result(tmp_path, dataclasses.replace(failed, status="ok", reason=None, metrics=metrics))
     assert plan.is_up_to_date(wanted, tmp_path) == done
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [([0.00034, None], "0.34 ms"), ([0.5, 0.25], "0.375"), ([0.0], "0"), ([None], "-")],
+)
+def test_short_times_are_told_in_milliseconds(values, text):
+    assert report._mean_seconds(values) == text
 
 
 def test_a_trial_of_other_settings_has_another_key():

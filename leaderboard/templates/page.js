@@ -261,6 +261,7 @@
     }
     scroll.append(table);
     made.append(scroll);
+    watch(scroll);
     return made;
   }
   function fit() {
@@ -270,6 +271,26 @@
     }
   }
   addEventListener("resize", fit);
+
+  // What is wider than its place says so above, and fades out where there is more of it.
+  const sizes = new ResizeObserver((entries) => {
+    const areas = new Set(entries.map((entry) => entry.target.closest(".scroll")));
+    requestAnimationFrame(() => areas.forEach(hint));
+  });
+  function watch(area) {
+    const line = element("p", "Scroll sideways for the rest \u2192", { class: "sideways" });
+    line.hidden = true;
+    area.before(line);
+    area.addEventListener("scroll", () => hint(area), { passive: true });
+    sizes.observe(area);
+    for (const child of area.children) sizes.observe(child);
+  }
+  function hint(area) {
+    const rest = area.scrollWidth - area.clientWidth;
+    area.previousElementSibling.hidden = rest <= 1;
+    area.classList.toggle("more", rest - area.scrollLeft > 1);
+  }
+  for (const area of document.querySelectorAll(".scroll")) watch(area);
 
   // Why a guarantee is what it is.
   const reason = document.getElementById("reason");
