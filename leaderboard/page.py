@@ -582,9 +582,9 @@ def about(
         + ". A method whose flow is exact commands the velocity that leads to its own next state.",
         "- **Units**: " + "; ".join(f"{f} lengths in {u}" for f, u in units.items()) + ".",
         "- **Aggregates**: the interquartile mean is the mean of the middle half of the scores. A "
-        "score of ∞ is a runaway and counts. The mean rank is taken over environments and over "
+        "score of ∞ is a runaway and counts. The mean rank is taken over environments and, "
         + "; ".join(
-            f"{KINDS[motion]} over " + ", ".join(get_metric(m).title for m in names)
+            f"{KINDS[motion]}, over " + ", ".join(get_metric(m).title for m in names)
             for motion, names in RANKED.items()
         )
         + ", those that apply to every competitor; a cell that failed ranks last, and "
