@@ -1,7 +1,8 @@
 """Results as boards: one for each family and protocol, a row for each method, nothing dropped.
 
 A cell is (method, environment, seed). A cell that failed and a cell that was never run are both nan
-here: they count as missing, rank last, and are listed.
+here: they count as missing and are listed. One that failed ranks last; ranks are taken where all
+that are ranked were run.
 """
 
 from __future__ import annotations
@@ -73,6 +74,10 @@ HOLDS: dict[Motion, str] = {
 """The stability that is set against it: the share of the starts that end where they should."""
 
 
+LEAST_SHARED = 0.5
+"""Share of the environments of what was run the most that all ranked rows must have in common."""
+
+
 @dataclass(frozen=True)
 class Row:
     """One method on one family under one protocol."""
@@ -117,6 +122,11 @@ class Row:
         return f"{self.n_scored} of {self.n_expected}"
 
     @property
+    def ran(self) -> set[str]:
+        """Environments that the method was run on, failed or not."""
+        return {environment for environment, _ in self.cells}
+
+    @property
     def failed(self) -> list[Result]:
         """Cells that were run and have no scores."""
         return [cell for cell in self.cells.values() if not cell.ok]
@@ -154,6 +164,15 @@ class Row:
                 if (environment, seed) in self.cells:
                     found.setdefault(environment, []).append(self._score(metric, environment, seed))
         return {environment: np.array(scores) for environment, scores in found.items()}
+
+    def run_means(self, metric: str, environments: Sequence[str]) -> NDArray[np.float64]:
+        """Return means over the seeds that were run, shape (E,), nan where one failed.
+
+        Of environments that the method was run on.
+        """
+        found = self.run_scores(metric)
+        with np.errstate(invalid="ignore"):
+            return np.array([found[environment].mean() for environment in environments])
 
     def _score(self, metric: str, environment: str, seed: int) -> float:
         cell = self.cells.get((environment, seed))
@@ -206,7 +225,8 @@ class Board:
     motion: Motion
     """Whether its motions end at a goal or repeat."""
     rows: tuple[Row, ...]
-    """Competitors by mean rank, best first; then by name those that use time, the references."""
+    """Competitors by mean rank, best first, then those that have none; then by name those that use
+    time, the references."""
 
     @property
     def competitors(self) -> tuple[Row, ...]:
@@ -227,8 +247,14 @@ class Board:
 
     @cached_property
     def mean_rank(self) -> dict[str, float]:
-        """Competitor's name -> mean of its ranks over environments and `RANKED`."""
+        """Name of each competitor that is ranked -> mean of its ranks, by `ranks_of`."""
         return ranks_of(self.competitors)
+
+    @property
+    def first(self) -> set[str]:
+        """Names of the competitors of the best mean rank."""
+        best = np.nanmin([*self.mean_rank.values(), np.inf])
+        return {name for name, rank in self.mean_rank.items() if rank == best}
 
     def best(self, values: Mapping[str, float], metric: str) -> set[str]:
         """Return the methods whose value is the best, of those that compete.
@@ -236,9 +262,8 @@ class Board:
         Only rows that cover as many cells as the fullest one compete: a mean over the three
         easiest environments is no better than one over all.
         """
-        better = get_metric(metric).better if metric != "mean_rank" else "lower"
         full = {row.method for row in self.fullest}
-        sign = 1.0 if better == "lower" else -1.0
+        sign = 1.0 if get_metric(metric).better == "lower" else -1.0
         fit = {
             name: sign * value
             for name, value in values.items()
@@ -247,19 +272,37 @@ class Board:
         return {name for name, value in fit.items() if value == min(fit.values())}
 
 
+def common_ground(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
+    """Return which of the rows can be ranked, and the environments that all of these were run on.
+
+    Rows are taken in turn, what was run the most first. One is left out with which fewer than
+    `LEAST_SHARED` of the first one's environments would be common to all.
+    """
+    taken: set[str] = set()
+    ground: set[str] = set()
+    least = LEAST_SHARED * max((len(row.ran) for row in rows), default=0)
+    for row in sorted(rows, key=lambda row: (-len(row.ran), row.method)):
+        common = ground & row.ran if taken else row.ran
+        if len(common) >= least:
+            taken.add(row.method)
+            ground = common
+    ranked = [row for row in rows if row.method in taken]
+    return ranked, [e for row in ranked[:1] for e in row.environments if e in ground]
+
+
 def ranks_of(rows: Sequence[Row]) -> dict[str, float]:
-    """Return mean ranks of competitors over the environments that any of them was run on.
+    """Return mean ranks of competitors over the environments that all of them were run on.
 
     Of `RANKED`, the metrics that apply to every one of them: a policy that has no field to be asked
-    for velocities does not rank last for it. A method without any score ranks last by all.
+    for velocities does not rank last for it. A method without any score ranks last by all. Those
+    that `common_ground` leaves out have no rank.
     """
+    rows, ground = common_ground(rows)
     if not rows:
         return {}
-    tried = {environment for row in rows for environment, _ in row.cells}
-    kept = [i for i, environment in enumerate(rows[0].environments) if environment in tried]
     ranks = [
         mean_ranks(
-            np.stack([row.by_environment(metric)[kept] for row in rows]), get_metric(metric).better
+            np.stack([row.run_means(metric, ground) for row in rows]), get_metric(metric).better
         )
         for metric in RANKED[rows[0].motion]
         if (scored := [row for row in rows if row.n_scored])
@@ -298,7 +341,7 @@ def _board(family: str, protocol: str, results: Sequence[Result]) -> Board:
     ]
     ranks = ranks_of([row for row in rows if row.competes])
     rows.sort(
-        key=lambda row: (row.reference, row.uses_time, ranks.get(row.method, 0.0), row.method)
+        key=lambda row: (row.reference, row.uses_time, ranks.get(row.method, np.inf), row.method)
     )
     return Board(family, protocol, environments, motion, tuple(rows))
 

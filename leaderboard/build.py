@@ -29,6 +29,12 @@ from matplotlib.figure import Figure
 from page import render
 
 from iflow_gym.figures import save_figure
+from iflow_gym.leaderboard.submission import (
+    SUBMISSION_FILE,
+    Submission,
+    SubmissionError,
+    read_submission,
+)
 from iflow_gym.results import Result, ResultFileError, read_results
 
 HERE = Path(__file__).resolve().parent
@@ -52,6 +58,8 @@ class Plan:
     boards: Sequence[Board]
     units: Mapping[str, str]
     drawings: Mapping[str, Drawing]
+    submissions: Mapping[str, Submission]
+    """By method's name, of those whose folder says what the method is."""
 
     @property
     def paths(self) -> dict[str, str]:
@@ -60,12 +68,18 @@ class Plan:
 
     def markdown(self) -> str:
         """Return LEADERBOARD.md."""
-        return render(self.boards, self.results, self.paths, self.units)
+        return render(self.boards, self.results, self.paths, self.units, self.submissions)
 
     def html(self, output: Path, figures: Mapping[str, Figure]) -> str:
         """Return index.html for a folder; without figures, the page without pictures."""
         return web.render(
-            self.boards, self.results, self.units, output, drawings=self.drawings, figures=figures
+            self.boards,
+            self.results,
+            self.units,
+            output,
+            drawings=self.drawings,
+            figures=figures,
+            submissions=self.submissions,
         )
 
 
@@ -80,6 +94,8 @@ def plan(results_folder: Path) -> Plan:
         If it holds no records.
     ResultFileError
         If a file in it is no whole record.
+    SubmissionError
+        If a method's `method.toml` is not what it should be.
     """
     results = read_results(results_folder)
     if not results:
@@ -88,7 +104,13 @@ def plan(results_folder: Path) -> Plan:
             f"--output {results_folder}` first."
         )
     boards = make_boards(results)
-    return Plan(results, boards, units_of(boards), drawings_of(boards, results_folder))
+    submissions = {
+        name: read_submission(results_folder / name)
+        for name in sorted({result.method for result in results})
+        if (results_folder / name / SUBMISSION_FILE).is_file()
+    }
+    drawings = drawings_of(boards, results_folder)
+    return Plan(results, boards, units_of(boards), drawings, submissions)
 
 
 def build(results_folder: Path, output: Path) -> list[Path]:
@@ -150,7 +172,7 @@ def main() -> int:
         if options.check:
             return _report(check(options.results, options.output))
         written = build(options.results, options.output)
-    except (FileNotFoundError, NothingToBuildError, ResultFileError) as error:
+    except (FileNotFoundError, NothingToBuildError, ResultFileError, SubmissionError) as error:
         print(f"build.py: {error}", file=sys.stderr)
         return 2
     for path in written:

@@ -6,7 +6,7 @@ import itertools
 import math
 
 import numpy as np
-from board import MAIN, Board, Row
+from board import MAIN, Board, Row, common_ground
 
 from iflow_gym.metrics import get_metric
 from iflow_gym.statistics import (
@@ -25,29 +25,32 @@ N_THRESHOLDS = 80
 """Points of a profile."""
 
 
-def tried(board: Board) -> list[str]:
-    """Return the environments that any competitor was run on."""
-    ran = {environment for row in board.competitors for environment, _ in row.cells}
-    return [environment for environment in board.environments if environment in ran]
-
-
 def compared(board: Board) -> list[Row]:
     """Return the competitors that the main metric applies to, failed ones included."""
     metric = MAIN[board.motion]
     return [row for row in board.competitors if row.applies(metric) or not row.n_scored]
 
 
+def ranked(board: Board) -> tuple[list[Row], list[str]]:
+    """Return those of `compared` whose ranks are tested, and the environments that all were run on.
+
+    A cell that was never run says nothing of a method, and is no defeat.
+    """
+    return common_ground(compared(board))
+
+
 def rank_comparison(board: Board) -> RankComparison | None:
     """Return Friedman's and Nemenyi's tests by the main metric; a block is an environment.
 
-    A score of a block is the mean over the seeds, so that seeds do not count as data sets of their
-    own. None below `FEWEST_ENVIRONMENTS`, or three methods.
+    Of the methods and environments of `ranked`. A score of a block is the mean over the seeds, so
+    that seeds do not count as data sets of their own. None below `FEWEST_ENVIRONMENTS`, or three
+    methods.
     """
-    metric, rows, kept = MAIN[board.motion], compared(board), tried(board)
-    if len(kept) < FEWEST_ENVIRONMENTS or len(rows) < 3:
+    metric = MAIN[board.motion]
+    rows, ground = ranked(board)
+    if len(ground) < FEWEST_ENVIRONMENTS or len(rows) < 3:
         return None
-    places = [board.environments.index(environment) for environment in kept]
-    scores = np.stack([row.by_environment(metric)[places] for row in rows])
+    scores = np.stack([row.run_means(metric, ground) for row in rows])
     return compare_ranks(scores, get_metric(metric).better)
 
 

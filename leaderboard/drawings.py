@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from board import HOLDS, MAIN, Board, Row
 from classes import confusion
-from comparisons import compared, is_logarithmic, profiles, rank_comparison
+from comparisons import is_logarithmic, profiles, rank_comparison, ranked
 from matplotlib.figure import Figure
 from page import HEADLINE
 from tables import PERCENT, heading, shape_name
@@ -378,7 +378,7 @@ def ranks(board: Board) -> Figure:
     """Mean ranks by the main accuracy, with the critical difference."""
     comparison = rank_comparison(board)
     assert comparison is not None
-    rows = compared(board)
+    rows, _ = ranked(board)
     styles = _styles(rows)
     return rank_figure(comparison, [styles[row.method] for row in rows])
 

@@ -6,9 +6,10 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import get_args
 
-from board import MAIN, RANKED, Board, motion_of
+from board import MAIN, RANKED, Board, Row, common_ground, motion_of
 from classes import confusion, fraction_right
-from comparisons import compared, improvements, rank_comparison
+from comparisons import compared, improvements, rank_comparison, ranked
+from records import origin, unscored
 from tables import (
     BY_MEAN,
     Aggregates,
@@ -27,6 +28,7 @@ from tables import (
 )
 
 from iflow_gym.baselines.registry import METHODS, REFERENCES
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.metrics import METRICS, Motion, get_metric, metrics_hash, metrics_of
 from iflow_gym.results import Result
 from iflow_gym.statistics import Improvement, RankComparison
@@ -69,6 +71,9 @@ MEMORY = (
     "a batch's is shared by its cells."
 )
 """What `peak_memory_mb` of a record is."""
+
+NOTE_LENGTH = 200
+"""Characters of the longest note on a method that is in the page."""
 
 HEADLINE = "LASA-26"
 """The family that the figures of all methods are of."""
@@ -150,23 +155,39 @@ def footnote(board: Board, found: Aggregates) -> str:
             for row in incomplete
         )
         text += (
-            ". An incomplete row is aggregated over the cells it has, ranks last on the others, "
+            ". An incomplete row is aggregated over the cells it has, ranks last where it failed, "
+            "and competes for the bold value only with rows as full."
         )
-        text += "and competes for the bold value only with rows as full."
-    return text
+    rows, ground = common_ground(board.competitors)
+    if rows and len(ground) < len(board.environments):
+        text += (
+            f" Mean ranks are over {len(ground)} of {len(board.environments)} environments, those "
+            "that all ranked methods were run on."
+        )
+    return text + not_ranked(board.competitors, rows)
+
+
+def not_ranked(rows: Sequence[Row], ranked: Sequence[Row]) -> str:
+    """Say which rows are not ranked, and why, with a space before; nothing where all are."""
+    names = {row.method for row in ranked}
+    left = [
+        f"{escaped(row.title)} (on {len(row.ran)} of {len(row.environments)} environments)"
+        for row in rows
+        if row.method not in names
+    ]
+    if not left:
+        return ""
+    return f" Not ranked, since run on too few of the others' environments: {'; '.join(left)}."
 
 
 def failures(boards: Sequence[Board]) -> list[str]:
     """Return the section of cells that have no scores."""
     lines = [
-        [
-            f"{escaped(row.title)} on {shape_name(cell.environment)}, {board.protocol}, "
-            f"seed {cell.seed}",
-            _one_line(cell.reason or ""),
-        ]
+        [f"{escaped(row.title)} on {group.names}, {board.protocol}", _one_line(group.reason)]
         for board in boards
         for row in board.rows
-        for cell in row.failed
+        for group in unscored(row)
+        if group.reason
     ]
     never = [
         f"- {escaped(row.title)}: {row.n_never_run} of {row.n_expected} cells of {board.family}, "
@@ -184,8 +205,7 @@ def failures(boards: Sequence[Board]) -> list[str]:
 
 
 def _one_line(reason: str) -> str:
-    first = reason.strip().splitlines()[0] if reason.strip() else "no reason given"
-    return escaped(first)
+    return escaped(reason.splitlines()[0])
 
 
 SMOKE = (
@@ -303,6 +323,7 @@ def render(
     results: Sequence[Result],
     figures: Mapping[str, str],
     units: Mapping[str, str],
+    submissions: Mapping[str, Submission],
 ) -> str:
     """Return the page.
 
@@ -316,6 +337,8 @@ def render(
         Name to path relative to the page, of the figures that were drawn.
     units
         Family to its unit of length.
+    submissions
+        What methods' folders say of them, by the methods' names.
     """
     page = ["# Leaderboard", ""]
     page += [
@@ -350,6 +373,7 @@ def render(
     page += shapes_section(boards)
     page += failures(boards)
     page += about(results, boards, units)
+    page += origins(submissions)
     return "\n".join(page).rstrip() + "\n"
 
 
@@ -361,7 +385,7 @@ def comparison_section(board: Board, figures: Mapping[str, str]) -> list[str]:
     title = get_metric(MAIN[board.motion]).title
     page = [f"### Differences between methods, by {title}", ""]
     if (comparison := rank_comparison(board)) is not None:
-        page += [ranks_in_words(comparison), "", *_pictures(figures, ("ranks",))]
+        page += [ranks_in_words(board, comparison), "", *_pictures(figures, ("ranks",))]
     rows = compared(board)
     page += [improvement_in_words(found), ""]
     lines = [
@@ -385,15 +409,16 @@ def percent_of(found: Improvement) -> str:
     return text if low == high or "nan" in low else f"{text}<br><sub>{low} to {high}</sub>"
 
 
-def ranks_in_words(comparison: RankComparison) -> str:
+def ranks_in_words(board: Board, comparison: RankComparison) -> str:
     """Say what the tests of ranks say."""
     p = comparison.p_value
     return (
-        f"Friedman's test over {comparison.n_environments} environments, the mean over the seeds "
-        f"in each (seeds are no data sets of their own): chi² = {comparison.statistic:.1f}, "
-        f"p {'< 0.001' if p < 0.001 else f'= {p:.3f}'}. Mean ranks further apart than "
-        f"{comparison.critical_difference:.2f} differ by Nemenyi's test at "
-        f"{100 * comparison.alpha:.0f} % (Demšar 2006)."
+        f"Friedman's test over the {comparison.n_environments} environments that all its methods "
+        "were run on, the mean over the seeds in each (seeds are no data sets of their own): "
+        f"chi² = {comparison.statistic:.1f}, p {'< 0.001' if p < 0.001 else f'= {p:.3f}'}. Mean "
+        f"ranks further apart than {comparison.critical_difference:.2f} differ by Nemenyi's test "
+        f"at {100 * comparison.alpha:.0f} % (Demšar 2006)."
+        f"{not_ranked(compared(board), ranked(board)[0])}"
     )
 
 
@@ -557,12 +582,13 @@ def about(
         + ". A method whose flow is exact commands the velocity that leads to its own next state.",
         "- **Units**: " + "; ".join(f"{f} lengths in {u}" for f, u in units.items()) + ".",
         "- **Aggregates**: the interquartile mean is the mean of the middle half of the scores. A "
-        "score of ∞ is a runaway and counts. The mean rank is taken over environments and over "
+        "score of ∞ is a runaway and counts. The mean rank is taken over environments and, "
         + "; ".join(
-            f"{KINDS[motion]} over " + ", ".join(get_metric(m).title for m in names)
+            f"{KINDS[motion]}, over " + ", ".join(get_metric(m).title for m in names)
             for motion, names in RANKED.items()
         )
-        + ", those that apply to every competitor; a cell without scores ranks last.",
+        + ", those that apply to every competitor; a cell that failed ranks last, and "
+        "environments that not all ranked methods were run on are left out.",
         "- **Guarantee**: *proved* by construction for every state, *verified* on a bounded region "
         "with an error bound, *sampled* where it was tried, or *none*. The methods' own "
         "reasons, as given for the first shape:",
@@ -592,6 +618,22 @@ def about(
     definitions = [[m.title, m.unit, m.better, escaped(m.definition)] for m in METRICS]
     page += table(["Metric", "Unit", "Better", "Definition"], definitions)
     return [*page, "</details>", ""]
+
+
+def origins(submissions: Mapping[str, Submission]) -> list[str]:
+    """Return where each method comes from, folded; long notes are in index.html alone."""
+    if not submissions:
+        return []
+    page = ["<details><summary>Where each method comes from</summary>", ""]
+    for one in sorted(submissions.values(), key=lambda one: one.title.lower()):
+        said = []
+        for term, text, *address in origin(one):
+            if term == "Note" and len(text) > NOTE_LENGTH:
+                continue
+            words = f"[{escaped(text)}](<{address[0]}>)" if address else escaped(text)
+            said.append(f"{term.lower()}: {words.rstrip('.')}")
+        page.append(f"- **{escaped(one.title)}**, {'; '.join(said)}.")
+    return [*page, "", "</details>", ""]
 
 
 def _times(results: Sequence[Result]) -> str:

@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from board import Board, Row
 from tables import heading, shape_name, shown
 
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.metrics import Metric, metrics_of
-from iflow_gym.results import Result
+from iflow_gym.results import Result, short_name
 from iflow_gym.statistics import mean_intervals
 
 SETTING_LENGTH = 200
 """Characters of a setting that are shown."""
 
 
-def details(board: Board, row: Row, length_unit: str) -> dict[str, Any]:
-    """Return what is known of a row, in words, for JSON."""
+def details(
+    board: Board, row: Row, length_unit: str, submission: Submission | None = None
+) -> dict[str, Any]:
+    """Return what is known of a row, in words, for JSON; a fact's third entry is its address."""
     cells = [row.cells[key] for key in sorted(row.cells)]
     metrics = [m for m in metrics_of(board.motion) if row.applies(m.name)]
     scores = motion_scores(board, row, metrics)
     return {
         "facts": [
             ["Method", f"{row.title} ({row.method})"],
+            *origin(submission),
             ["Class", _listed(cell.target for cell in cells)],
             ["Seeds", ", ".join(map(str, row.seeds))],
             ["Cells with scores", row.coverage],
@@ -44,8 +50,29 @@ def details(board: Board, row: Row, length_unit: str) -> dict[str, Any]:
     }
 
 
+def origin(submission: Submission | None) -> list[list[str]]:
+    """Return paper, code and note of a method, each with its address where it has one."""
+    if submission is None:
+        return []
+    paper, link = submission.paper, address(submission.link)
+    found = []
+    if paper != "none":
+        found.append(["Paper", paper, link])
+    elif link:
+        found.append(["Paper", link, link])
+    found.append(["Code", submission.code, address(submission.code)])
+    if submission.note is not None:
+        found.append(["Note", submission.note, ""])
+    return [entry if entry[2] else entry[:2] for entry in found]
+
+
+def address(text: str | None) -> str:
+    """Return text that may be a link's address, of the web; else nothing."""
+    return text if text is not None and text.startswith(("https://", "http://")) else ""
+
+
 def motion_scores(board: Board, row: Row, metrics: Sequence[Metric]) -> list[list[Any]]:
-    """Return a line for each environment: its name, and for each metric a number and interval.
+    """Return a line for each environment that was run: name, and a number and interval a metric.
 
     The number is the mean over the seeds. The interval is a 95 % bootstrap interval over the scored
     demonstrations, each its mean over the seeds; of what has one number a cell it is the least
@@ -57,7 +84,6 @@ def motion_scores(board: Board, row: Row, metrics: Sequence[Metric]) -> list[lis
     for environment in board.environments:
         ran = [row.cells[environment, s] for s in row.seeds if (environment, s) in row.cells]
         if not ran:
-            lines.append([shape_name(environment), "never run"])
             continue
         good = [cell for cell in ran if cell.ok]
         if not good:
@@ -108,16 +134,75 @@ def _over_demonstrations(
     return found
 
 
-def missing(row: Row) -> list[list[str]]:
-    """Return the cells without scores: which, and why."""
-    found = []
+@dataclass(frozen=True)
+class Unscored:
+    """Cells of a row that have no scores for the same reason."""
+
+    reason: str
+    """Of the first of them; nothing where they were never run."""
+    n: int
+    names: str
+    """Which, as "Angle, Line (seed 0)"."""
+    differ: bool
+    """Whether the others' reasons are other words than the first one's."""
+
+
+def unscored(row: Row) -> list[Unscored]:
+    """Return the cells without scores in groups: those never run, and by reason those that failed.
+
+    Reasons are alike whose first lines differ in numbers and in the motion's name alone.
+    """
+    groups: dict[str, list[tuple[str, int, str]]] = defaultdict(list)
     for environment in row.environments:
         for seed in row.seeds:
             cell = row.cells.get((environment, seed))
-            if cell is None or not cell.ok:
-                why = "never run" if cell is None else (cell.reason or "no reason given").strip()
-                found.append([f"{shape_name(environment)}, seed {seed}", why])
-    return found
+            if cell is not None and cell.ok:
+                continue
+            reason = "" if cell is None else (cell.reason or "").strip() or "no reason given"
+            groups[_alike(reason, environment)].append((shape_name(environment), seed, reason))
+    return [
+        Unscored(
+            reason=cells[0][2],
+            n=len(cells),
+            names=_names((name, seed) for name, seed, _ in cells),
+            differ=len({reason for *_, reason in cells}) > 1,
+        )
+        for cells in groups.values()
+    ]
+
+
+def _alike(reason: str, environment: str) -> str:
+    """Return the first line of a reason without numbers and without the motion's name."""
+    first = reason.partition("\n")[0]
+    for name in (environment, short_name(environment), shape_name(environment)):
+        first = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "…", first)
+    return re.sub(r"[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?", "#", first)
+
+
+def _names(cells: Iterable[tuple[str, int]]) -> str:
+    """Return motions and seeds in words, those of the same seeds together."""
+    seeds: dict[str, list[int]] = defaultdict(list)
+    for name, seed in cells:
+        seeds[name].append(seed)
+    together: dict[tuple[int, ...], list[str]] = defaultdict(list)
+    for name, own in seeds.items():
+        together[tuple(own)].append(name)
+    return "; ".join(
+        f"{', '.join(names)} (seed{'s' * (len(own) > 1)} {', '.join(map(str, own))})"
+        for own, names in together.items()
+    )
+
+
+def missing(row: Row) -> list[list[str]]:
+    """Return a line for each group of cells without scores: what became of them, which, and why."""
+    lines = []
+    for group in unscored(row):
+        text = f"{group.n} {'cell' if group.n == 1 else 'cells'}: {group.names}"
+        if group.reason:
+            others = "\nThe others' reasons read alike." if group.differ else ""
+            text += f"\n{group.reason}{others}"
+        lines.append(["failed" if group.reason else "never run", text])
+    return lines
 
 
 def guarantees_of(row: Row) -> list[list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -44,6 +44,9 @@ Aggregates = dict[tuple[str, str], "Aggregate | None"]
 # Numbers ------------------------------------------------------------------------------------
 
 
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def number(value: float | None) -> str:
     """Return three significant digits, "∞" for a runaway, "≈ 0" for rounding, "–" for nothing."""
     if value is None or math.isnan(value):
@@ -54,8 +57,11 @@ def number(value: float | None) -> str:
         return "0"
     if abs(value) < ROUNDING:
         return "≈ 0"
-    if abs(value) < 1e-3 or abs(value) >= 1e6:
-        return f"{value:.1e}"
+    if 1e-4 <= abs(value) < 1e-3:
+        return f"{value:.2g}"
+    if abs(value) < 1e-4 or abs(value) >= 1e6:
+        digits, _, power = f"{value:.1e}".partition("e")
+        return f"{digits}·10{str(int(power)).translate(SUPERSCRIPTS)}"
     if value == int(value):
         return f"{value:.0f}"
     decimals = max(0, 2 - math.floor(math.log10(abs(value))))
@@ -76,8 +82,16 @@ def percent(value: float | None) -> str:
 
 
 def shown(metric: str, value: float | None) -> str:
-    """Return a value as its metric is shown."""
+    """Return a value as its metric is shown: in percent, or below a millisecond with that unit."""
+    if value is not None and get_metric(metric).unit == "s" and ROUNDING <= value < 1e-3:
+        return f"{number(1e3 * value)} ms" if value >= 1e-4 else f"{number(1e6 * value)} µs"
     return percent(value) if metric in PERCENT else number(value)
+
+
+def with_unit(metric: str, value: float) -> str:
+    """Return a value as it is shown, with its metric's unit unless that is said already."""
+    text = shown(metric, value)
+    return text if text.endswith("s") else f"{text} {get_metric(metric).unit}"
 
 
 def heading(metric: str, length_unit: str) -> str:
@@ -226,17 +240,17 @@ def reward_of(row: Row) -> str:
 
 
 def outside(board: Board) -> list[tuple[str, str]]:
-    """Return title and reason of each registered method that cannot learn a board's motions."""
+    """Return which registered methods cannot learn a board's motions, and why: titles, reason."""
     if board.motion == "goal":
         asked = [(load_method(name), "learns_goals") for name in METHODS]
     else:
         asked = [(load_method(name), "learns_cycles") for name in METHODS]
     here = {row.method for row in board.rows}
-    return [
-        (method.title, method.not_learned)
-        for method, attribute in asked
-        if method.name not in here and not getattr(method, attribute)
-    ]
+    titles: dict[str, list[str]] = defaultdict(list)
+    for method, attribute in asked:
+        if method.name not in here and not getattr(method, attribute):
+            titles[method.not_learned].append(method.title)
+    return [(", ".join(names), why) for why, names in titles.items()]
 
 
 def named(row: Row) -> str:
@@ -247,7 +261,7 @@ def named(row: Row) -> str:
 
 def eligible_methods(board: Board) -> set[str]:
     """Return the competitors that may have the best value: those that cover the most cells."""
-    return board.best(dict.fromkeys((row.method for row in board.competitors), 0.0), "mean_rank")
+    return {row.method for row in board.fullest}
 
 
 def interval(metric: str, ends: Interval, value: str) -> str:
@@ -272,8 +286,10 @@ def rank_of(board: Board, row: Row) -> str:
     """Return a row's mean rank, bold if it is the best; nothing for what does not compete."""
     if not row.competes:
         return ""
+    if row.method not in board.mean_rank:
+        return "–"
     text = f"{board.mean_rank[row.method]:.2f}"
-    return f"**{text}**" if row.method in board.best(board.mean_rank, "mean_rank") else text
+    return f"**{text}**" if row.method in board.first else text
 
 
 def guarantee_of(row: Row) -> str:

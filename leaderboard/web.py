@@ -16,7 +16,7 @@ from typing import Any
 
 from board import HOLDS, MAIN, RANKED, Board, Row
 from classes import confusion, fraction_right
-from comparisons import FEWEST_ENVIRONMENTS, compared, improvements, rank_comparison
+from comparisons import FEWEST_ENVIRONMENTS, compared, improvements, rank_comparison, ranked
 from drawings import FEWEST_FOR_BOXES, Drawing, first_cell, n_run, number_figures
 from inline import Styles, inline_svg, moving_webp, panel_pictures, webp
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -48,9 +48,11 @@ from tables import (
     shape_name,
     shown,
     statistic_of,
+    with_unit,
 )
 
 from iflow_gym.figures import PALETTE
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.metrics import METRICS, Motion, get_metric, metrics_of
 from iflow_gym.results import Result
 
@@ -124,6 +126,7 @@ def render(
     *,
     drawings: Mapping[str, Drawing],
     figures: Mapping[str, Figure],
+    submissions: Mapping[str, Submission],
 ) -> str:
     """Return the page.
 
@@ -140,6 +143,8 @@ def render(
     drawings, figures
         The sheets and what was drawn of them, whose panels make the gallery; without figures the
         page has no pictures at all, and is quick to make.
+    submissions
+        What methods' folders say of them, by the methods' names.
     """
     pictures = bool(figures) or not drawings
     styles = Styles()
@@ -148,7 +153,9 @@ def render(
     for board in boards:
         unit = units.get(board.family, "length")
         key = identifier(f"{board.family}-{board.protocol}")
-        data[key] = {row.method: details(board, row, unit) for row in board.rows}
+        data[key] = {
+            row.method: details(board, row, unit, submissions.get(row.method)) for row in board.rows
+        }
         families.setdefault(board.family, []).append(
             board_context(board, unit, key, drawings, figures, styles if pictures else None)
         )
@@ -332,21 +339,18 @@ def row_groups(board: Board, columns: Sequence[Mapping[str, Any]]) -> list[dict[
             [row for row in board.rows if row.reference],
         ),
     ]
-    best = board.best(board.mean_rank, "mean_rank")
     return [
         {
             "kind": kind,
             "title": title,
-            "rows": [row_context(board, row, columns, best) for row in rows],
+            "rows": [row_context(board, row, columns) for row in rows],
         }
         for kind, title, rows in groups
         if rows
     ]
 
 
-def row_context(
-    board: Board, row: Row, columns: Sequence[Mapping[str, Any]], best: set[str]
-) -> dict[str, Any]:
+def row_context(board: Board, row: Row, columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return a line of the table."""
     rank = board.mean_rank.get(row.method) if row.competes else None
     entries: list[Entry] = [column["entries"][row.method] for column in columns]
@@ -358,7 +362,7 @@ def row_context(
         "guarantees": guarantees_of(row),
         "strength": _strength(row),
         "rank": None if rank is None else f"{rank:.2f}",
-        "rank_best": row.method in best,
+        "rank_best": row.method in board.first,
         "coverage": row.coverage,
         "complete": row.complete,
         "share": row.n_scored / row.n_expected,
@@ -415,9 +419,8 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
     if less := [row for row in board.competitors if row not in board.fullest]:
         names = ", ".join(f"{row.title} ({row.coverage})" for row in less)
         beside += f" Not compared here, since incomplete: {names}."
-    leading = board.best(board.mean_rank, "mean_rank")
-    if leading and first.method not in leading:
-        titles = " and ".join(row.title for row in board.competitors if row.method in leading)
+    if board.first and first.method not in board.first:
+        titles = " and ".join(row.title for row in board.competitors if row.method in board.first)
         beside += f" Best mean rank over all metrics of accuracy: {titles}."
     beside = beside.strip()
     result = [
@@ -426,8 +429,8 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
     ]
     fit, step = found[first.method, "fit_cpu_seconds"], found[first.method, "step_us"]
     if fit is not None and step is not None:
-        cost = f"{shown('fit_cpu_seconds', fit.iqm)} s of CPU to fit a motion"
-        beside = f"For {first.title}; a step takes {shown('step_us', step.iqm)} µs."
+        cost = f"{with_unit('fit_cpu_seconds', fit.iqm)} of CPU to fit a motion"
+        beside = f"For {first.title}; a step takes {with_unit('step_us', step.iqm)}."
         quick = [
             (a.iqm, row.title)
             for row in board.fullest
@@ -435,7 +438,7 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
         ]
         if quick and min(quick)[1] != first.title:
             seconds, name = min(quick)
-            beside += f" Quickest: {name}, {shown('fit_cpu_seconds', seconds)} s."
+            beside += f" Quickest: {name}, {with_unit('fit_cpu_seconds', seconds)}."
         result.append({"label": "Its cost", "value": cost, "text": beside, "beside": ""})
     return result
 
@@ -513,7 +516,7 @@ def rank_context(board: Board, styles: Styles | None) -> dict[str, Any] | None:
     if styles is not None:
         svg = inline_svg(number_figures(board)["ranks"](), "Mean ranks", styles)
     return {
-        "words": plain(ranks_in_words(comparison)),
+        "words": plain(ranks_in_words(board, comparison)),
         "caption": CAPTIONS["ranks"],
         "svg": Markup(svg),
     }
@@ -525,7 +528,8 @@ def improvement_context(board: Board) -> dict[str, Any] | None:
     if not found:
         return None
     rows = compared(board)
-    few = len(board.environments) < FEWEST_ENVIRONMENTS
+    has, ground = len(board.environments), len(ranked(board)[1])
+    of_them = f"has {has}" if has < FEWEST_ENVIRONMENTS else f"has {ground} that all were run on"
 
     def entry(one: Row, other: Row) -> dict[str, str] | None:
         p = found.get((one.method, other.method))
@@ -543,8 +547,8 @@ def improvement_context(board: Board) -> dict[str, Any] | None:
         "words": improvement_in_words(found),
         "few": (
             f"Friedman's and Nemenyi's tests take at least {FEWEST_ENVIRONMENTS} environments, and "
-            f"this family has {len(board.environments)}."
-            if few
+            f"this family {of_them}."
+            if ground < FEWEST_ENVIRONMENTS
             else ""
         ),
         "titles": [row.title for row in rows],

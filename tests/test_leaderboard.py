@@ -21,8 +21,10 @@ from iflow_gym.figures import (
     save_figure,
     scatter_figure,
 )
-from iflow_gym.metrics import metrics_hash
+from iflow_gym.leaderboard.submission import Submission
+from iflow_gym.metrics import metrics_hash, metrics_of
 from iflow_gym.plotting import GOAL
+from iflow_gym.registration import lasa_id
 from iflow_gym.results import write_result
 from iflow_gym.system import Guarantee
 
@@ -33,8 +35,9 @@ def boards_of(builder, results):
     return builder.make_boards(results)
 
 
-def render(builder, results):
-    return builder.render(boards_of(builder, results), results, {}, {"LASA-26": "mm"})
+def render(builder, results, **submissions):
+    boards = boards_of(builder, results)
+    return builder.render(boards, results, {}, {"LASA-26": "mm"}, submissions)
 
 
 def section(text, title, level="### "):
@@ -80,6 +83,63 @@ def test_a_failed_cell_ranks_last_and_stays(builder):
     assert board.mean_rank == pytest.approx({"good": (6 + 20 * 2) / 26, "bad": (12 + 20) / 26})
     assert [row.method for row in board.rows] == ["bad", "good"]
     assert len(board.rows[1].failed) == 20
+
+
+def test_ranks_are_over_what_all_were_run_on(builder):
+    """The worst on six shapes is no better for them, nor worse where it was never run."""
+    results = sweep("good", 2.0) + sweep("late", 1.0, shapes=SINGLE_MOTIONS[6:])
+    results += sweep("bad", 3.0)
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"late": 1.0, "good": 2.0, "bad": 3.0}
+    assert [row.method for row in board.rows] == ["late", "good", "bad"]
+    assert board.first == {"late"}
+    page = render(builder, results)
+    accuracy = section(page, "Accuracy")
+    assert "Mean ranks are over 20 of 26 environments, those that all ranked methods" in accuracy
+    assert "Not ranked" not in page
+    header, rows = rows_of(accuracy)
+    assert rows["Late"][header.index("Mean rank")] == "**1.00**"
+    comparison = builder.comparisons.rank_comparison(board)
+    assert comparison.n_environments == 20
+    assert comparison.mean_ranks == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_a_seed_that_was_never_run_costs_no_rank(builder):
+    results = sweep("good", 1.0) + sweep("good", 1.0, shapes=SINGLE_MOTIONS[:3], seed=1)
+    (board,) = boards_of(builder, results + sweep("bad", 2.0))
+    assert board.mean_rank == {"good": 1.0, "bad": 2.0}
+    results += [failed("good", s, seed=1) for s in SINGLE_MOTIONS[3:]]
+    (board,) = boards_of(builder, results + sweep("bad", 2.0))
+    assert board.mean_rank == pytest.approx({"good": (3 + 23 * 2) / 26, "bad": (6 + 23) / 26})
+
+
+def test_what_was_run_on_too_little_is_not_ranked_and_named(builder):
+    results = sweep("a", 1.0) + sweep("b", 2.0) + sweep("c", 3.0)
+    results += sweep("few", 0.1, shapes=SINGLE_MOTIONS[:12])
+    results += [failed("dead", s) for s in SINGLE_MOTIONS]
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"a": 1.0, "b": 2.0, "c": 3.0, "dead": 4.0}
+    assert [row.method for row in board.rows] == ["a", "b", "c", "dead", "few"]
+    comparison = builder.comparisons.rank_comparison(board)
+    assert comparison.n_environments == 26
+    assert comparison.mean_ranks == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    page = render(builder, results)
+    said = "Not ranked, since run on too few of the others' environments: Few (on 12 of 26 env"
+    assert said in section(page, "Accuracy")
+    assert said in section(page, "Differences between methods")
+    header, rows = rows_of(section(page, "Accuracy"))
+    assert rows["Few"][header.index("Mean rank")] == "–"
+    labels = [t.get_text() for t in builder.drawings.ranks(board).findobj(Text)]
+    assert not [text for text in labels if "Few" in text]
+    assert [text for text in labels if "Dead" in text]
+
+
+def test_methods_that_were_run_elsewhere_cut_nobodys_ranks(builder):
+    """With both halves in it the ranks would be over nothing: the first by name is taken."""
+    results = sweep("all", 2.0) + sweep("early", 1.0, shapes=SINGLE_MOTIONS[:13])
+    results += sweep("late", 1.0, shapes=SINGLE_MOTIONS[13:])
+    (board,) = boards_of(builder, results)
+    assert board.mean_rank == {"early": 1.0, "all": 2.0}
 
 
 def test_a_metric_that_no_field_means_no_last_rank(builder):
@@ -218,12 +278,31 @@ def test_a_cell_that_was_never_run_is_no_defeat(builder):
     ("value", "text"),
     [
         (2.1549, "2.15"), (0.0266, "0.0266"), (134.2, "134"), (8.0, "8"), (0.0, "0"),
-        (12345.6, "12346"), (1.5e7, "1.5e+07"), (2e-5, "2.0e-05"), (2e-14, "≈ 0"), (math.inf, "∞"),
+        (12345.6, "12346"), (1.5e7, "1.5·10⁷"), (2e-5, "2.0·10⁻⁵"), (-3.4e-4, "-0.00034"),
+        (9.96e-4, "0.001"), (2e-14, "≈ 0"), (math.inf, "∞"),
         (math.nan, "–"), (None, "–"),
     ],
 )  # fmt: skip
 def test_numbers(builder, value, text):
     assert builder.tables.shown("rmse", value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text", "with_unit"),
+    [
+        (3.4e-4, "0.340 ms", "0.340 ms"), (2.52e-5, "25.2 µs", "25.2 µs"),
+        (4.25e-6, "4.25 µs", "4.25 µs"),
+        (0.00822, "0.00822", "0.00822 s"), (12.5, "12.5", "12.5 s"), (0.0, "0", "0 s"),
+    ],
+)  # fmt: skip
+def test_seconds(builder, value, text, with_unit):
+    assert builder.tables.shown("fit_seconds", value) == text
+    assert builder.tables.with_unit("fit_seconds", value) == with_unit
+
+
+def test_other_units_are_said_once(builder):
+    assert builder.tables.with_unit("step_us", 3.25) == "3.25 µs"
+    assert builder.tables.shown("rmse", 3.4e-4) == "0.00034"
 
 
 @pytest.mark.parametrize(
@@ -272,10 +351,37 @@ def test_intervals_say_what_they_resample(builder):
 def test_failed_cells_are_listed_with_their_reasons(builder):
     results = [*sweep("good", shapes=SINGLE_MOTIONS[1:]), failed("good", "Angle")]
     text = render(builder, results)
-    assert "| Good on Angle, reproduction, seed 0 | RuntimeError: it \\| broke |" in text
+    assert "| Good on Angle (seed 0), reproduction | RuntimeError: it \\| broke |" in text
     assert "25 of 26 (1 failed, 0 never run)" in text
     header, rows = rows_of(text[text.index("Fréchet</summary>") :])
     assert rows["Angle"][header.index("Good")] == "failed"
+
+
+def test_cells_that_failed_for_the_same_reason_are_one_line(builder):
+    shapes = SINGLE_MOTIONS[:4]
+    results = sweep("good", shapes=SINGLE_MOTIONS[4:])
+    results += [
+        failed("good", s, reason=f"ValueError: {s} has {i + 0.5} s, e.g. {lasa_id(s)}")
+        for i, s in enumerate(shapes[:3])
+    ]
+    results += [failed("good", shapes[3], reason="ValueError: something else")]
+    text = section(render(builder, results), "Cells without scores", "## ")
+    lines = [line for line in text.splitlines() if line.startswith("| Good")]
+    assert len(lines) == 2
+    assert lines[0].startswith(f"| Good on {', '.join(shapes[:3])} (seed 0), reproduction | Value")
+    assert lines[1].endswith("| ValueError: something else |")
+
+
+def test_methods_that_cannot_learn_a_motion_are_told_by_reason(builder):
+    metrics = {m.name: 1.0 for m in metrics_of("cycle")}
+    results = [
+        record("good", "Angle", metrics=metrics, environment="iflow/Letter-I-v0", family="Letter")
+    ]
+    (board,) = boards_of(builder, results)
+    found = dict(builder.tables.outside(board))
+    assert found["SEDS, CLF-DM, Stable linear"] == "its systems end at a goal"
+    assert len(found) == len(set(found.values()))
+    assert "| SEDS, CLF-DM, Stable linear | not applicable |" in render(builder, results)
 
 
 def test_a_method_that_only_failed_is_still_there(builder):
@@ -392,6 +498,26 @@ def test_titles_and_reasons_cannot_break_the_page(builder):
     assert "<img>" not in text
     assert "[x](y)" not in text
     assert f"| {clean} | " in text
+
+
+def test_where_a_method_comes_from_is_said_and_a_long_note_is_not(builder):
+    said = {"name": "good", "title": "Good", "guarantee": "none", "hardware": "abacus"}
+    one = Submission(
+        **said,
+        paper="A. [B], *C*",
+        code="https://x.org/a(b)",
+        link="https://x.org/p",
+        note="Short.",
+    )
+    other = Submission(**said | {"title": "Bad"}, paper="none", code="a/b_c.py", note="x" * 201)
+    text = render(builder, sweep("good") + sweep("bad", 2.0), good=one, bad=other)
+    lines = text[text.index("Where each method comes from") :].splitlines()[2:4]
+    assert lines == [
+        "- **Bad**, code: a/b\\_c.py.",
+        "- **Good**, paper: [A. \\[B\\], \\*C\\*](<https://x.org/p>); "
+        "code: [https://x.org/a(b)](<https://x.org/a(b)>); note: Short.",
+    ]
+    assert "Where each method comes from" not in render(builder, sweep("good"))
 
 
 def test_what_memory_is_is_said(builder):
@@ -515,6 +641,22 @@ def test_the_script_prints_what_it_wrote(tmp_path):
     assert done.stdout.split() == [
         str(tmp_path / "out" / name) for name in ("LEADERBOARD.md", "index.html")
     ]
+
+
+def test_a_folders_method_toml_is_read_and_a_wrong_one_is_told(builder, tmp_path):
+    folder = tmp_path / "results"
+    write_result(folder, record("good", "Multi_Models_1"))
+    described = folder / "good" / "method.toml"
+    said = 'name = "good"\ntitle = "Good"\npaper = "A paper"\ncode = "https://x.org/code"\n'
+    described.write_text(said + 'guarantee = "none"\nhardware = "abacus"\n')
+    page, html, *_ = builder.build(folder, tmp_path / "out")
+    assert "- **Good**, paper: A paper; code: [https://x.org/code](<" in page.read_text()
+    assert '["Code","https://x.org/code","https://x.org/code"]' in html.read_text()
+    described.write_text(said)
+    done = run_script("--results", folder, "--output", tmp_path / "out")
+    assert done.returncode == 2
+    assert "expected guarantee, got none" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_a_check_finds_what_the_records_do_not_say(builder, tmp_path):

@@ -29,6 +29,10 @@ def address(builder, tmp_path_factory):
     results += sweep("good", 1.0, protocol="generalisation")
     for result in results:
         write_result(folder / "results", result)
+    (folder / "results" / "good" / "method.toml").write_text(
+        'name = "good"\ntitle = "Good"\npaper = "A paper"\ncode = "a/b.py"\nguarantee = "none"\n'
+        'hardware = "abacus"\nlink = "https://example.org/p?a=1&b=2"\n'
+    )
     builder.build(folder / "results", folder)
     return (folder / "index.html").as_uri()
 
@@ -180,7 +184,7 @@ def test_details(open_page):
     inside = page.locator(f"#{opener.get_attribute('aria-controls')}")
     text = inside.inner_text()
     assert "RuntimeError: it broke" in text
-    assert f"{SINGLE_MOTIONS[0]}, seed 0" in text
+    assert f"1 cell: {SINGLE_MOTIONS[0]} (seed 0)\nRuntimeError: it broke" in text
     assert "abacus" in text
     assert "numpy 2.0" in text
     assert inside.locator("tbody tr").count() == 26
@@ -192,6 +196,17 @@ def test_details(open_page):
     assert not inside.is_visible()
     page.get_by_role("button", name="Good").first.click()
     assert "n_steps" in page.locator("tr.details:visible").inner_text()
+
+
+def test_where_a_method_comes_from(open_page):
+    page = open_page()
+    page.get_by_role("button", name="Good").first.click()
+    inside = page.locator("tr.details:visible")
+    (link,) = inside.get_by_role("link").all()
+    assert link.inner_text() == "A paper"
+    assert link.get_attribute("href") == "https://example.org/p?a=1&b=2"
+    assert link.get_attribute("rel") == "noopener"
+    assert "a/b.py" in inside.inner_text()
 
 
 def test_the_reason_of_a_guarantee(open_page):
@@ -220,6 +235,39 @@ def test_it_can_be_read_in_either_colours_at_any_width(open_page, scheme, width)
     assert found["n"] > 300
     assert found["low"] == []
     assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_what_is_wider_than_a_phone_says_that_it_scrolls(open_page):
+    page = open_page(viewport={"width": 390, "height": 800})
+    page.get_by_role("button", name="Good").first.click()
+    areas = page.locator(".scroll:visible")
+    assert areas.count() >= 5
+    for area in areas.all():
+        assert area.get_attribute("tabindex") == "0"
+        assert area.get_attribute("role") == "region"
+        assert area.get_attribute("aria-label")
+    table = page.get_by_role("region", name="Scores, LASA-26, reproduction")
+    line = table.locator("xpath=preceding-sibling::*[1]")
+    figure = page.get_by_role("region", name="Figure: Every motion's scores")
+    inside = page.get_by_role("region", name="Every motion's scores", exact=True)
+    for area in (table, figure, inside):
+        above = area.locator("xpath=preceding-sibling::*[1]")
+        above.wait_for()
+        assert above.inner_text() == "Scroll sideways for the rest →"
+        assert "gradient" in area.evaluate("area => getComputedStyle(area).maskImage")
+    page.locator("select[name=time]").focus()
+    page.keyboard.press("Tab")
+    assert table.evaluate("area => getComputedStyle(area).outlineStyle") == "solid"
+    assert table.evaluate("area => getComputedStyle(area).maskImage") == "none"  # nor the outline
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("area => area.scrollLeft > 0", arg=table.element_handle())
+    table.evaluate("area => { area.scrollLeft = area.scrollWidth; }")
+    page.wait_for_function("area => !area.classList.contains('more')", arg=table.element_handle())
+    assert line.is_visible()  # there is more on the other side
+    page.set_viewport_size({"width": 1600, "height": 800})
+    line.wait_for(state="hidden")
+    assert not figure.locator("xpath=preceding-sibling::*[1]").is_visible()
+    assert "more" not in figure.get_attribute("class")
 
 
 def test_colours_by_the_button(open_page):

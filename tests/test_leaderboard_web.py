@@ -13,6 +13,7 @@ from leaderboard_records import failed, record, sweep
 from iflow_gym.datasets.lasa import SINGLE_MOTIONS
 from iflow_gym.figures import Point as FigurePoint
 from iflow_gym.figures import method_styles, scatter_figure
+from iflow_gym.leaderboard.submission import Submission
 from iflow_gym.system import Guarantee
 
 ROOT = Path(__file__).parents[1]
@@ -50,10 +51,12 @@ class Page(HTMLParser):
         ]
 
 
-def page_of(builder, results, tmp_path):
+def page_of(builder, results, tmp_path, **submissions):
     boards = builder.make_boards(results)
     units = {board.family: "mm" for board in boards}
-    return builder.web.render(boards, results, units, tmp_path, drawings={"x": None}, figures={})
+    return builder.web.render(
+        boards, results, units, tmp_path, drawings={"x": None}, figures={}, submissions=submissions
+    )
 
 
 def data_of(page):
@@ -104,7 +107,7 @@ def test_nothing_in_a_record_can_break_the_page(builder, tmp_path):
     assert not [a for _, a in page.elements if "onerror" in a]
     assert "<script>alert" not in text
     known = data_of(text)["LASA-26-reproduction"]["good"]
-    assert known["missing"] == [["Angle, seed 0", evil]]
+    assert known["missing"] == [["failed", f"1 cell: Angle (seed 0)\n{evil}"]]
     assert known["guarantees"] == [["none", evil]]
     (badge,) = page.find("button", **{"class": "badge none"})
     assert badge["data-reason"] == evil
@@ -126,19 +129,79 @@ def test_nothing_is_fetched(builder, tmp_path):
     assert not re.search(r"@import|url\((?!#)|fetch\(|XMLHttpRequest|sendBeacon", text)
 
 
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        (
+            {"link": "https://x.org/p"},
+            [["Paper", "A & <b>", "https://x.org/p"], ["Code", "a/b.py"]],
+        ),
+        (
+            {"paper": "none", "link": "https://x.org/p", "note": "</script>"},
+            [
+                ["Paper", "https://x.org/p", "https://x.org/p"],
+                ["Code", "a/b.py"],
+                ["Note", "</script>"],
+            ],
+        ),
+        (
+            {"code": "http://x.org", "link": "javascript:alert(1)"},
+            [["Paper", "A & <b>"], ["Code", "http://x.org", "http://x.org"]],
+        ),
+        ({"paper": "none", "code": "data:text/html,x"}, [["Code", "data:text/html,x"]]),
+    ],
+)
+def test_paper_code_and_note_are_in_the_details_and_only_the_webs_addresses_are_links(
+    builder, tmp_path, changes, facts
+):
+    fields = {"name": "good", "title": "Good", "paper": "A & <b>", "code": "a/b.py"}
+    one = Submission(**fields | changes, guarantee="none", hardware="abacus")
+    text = page_of(builder, sweep("good"), tmp_path, good=one)
+    Page(text)
+    known = data_of(text)["LASA-26-reproduction"]["good"]["facts"]
+    assert known[1 : 1 + len(facts)] == facts
+    assert known[1 + len(facts)][0] == "Class"
+
+
 def test_failed_cells_and_cells_never_run_are_in_the_details(builder, tmp_path):
     results = sweep("good", shapes=SINGLE_MOTIONS[2:])
     results += [failed("good", SINGLE_MOTIONS[0], reason="RuntimeError: it broke\nfile.py:1")]
     text = page_of(builder, results, tmp_path)
     known = data_of(text)["LASA-26-reproduction"]["good"]
     assert known["missing"] == [
-        [f"{SINGLE_MOTIONS[0]}, seed 0", "RuntimeError: it broke\nfile.py:1"],
-        [f"{SINGLE_MOTIONS[1]}, seed 0", "never run"],
+        ["failed", f"1 cell: {SINGLE_MOTIONS[0]} (seed 0)\nRuntimeError: it broke\nfile.py:1"],
+        ["never run", f"1 cell: {SINGLE_MOTIONS[1]} (seed 0)"],
     ]
     scores = {line[0]: line[1:] for line in known["scores"]}
     assert scores[SINGLE_MOTIONS[0]] == ["failed"]
-    assert scores[SINGLE_MOTIONS[1]] == ["never run"]
+    assert SINGLE_MOTIONS[1] not in scores
     assert "24 of 26" in row_of(text, "good")["cells"]
+
+
+def test_cells_without_scores_are_a_line_for_each_reason(builder, tmp_path):
+    shapes = SINGLE_MOTIONS
+    results = [r for seed in (0, 1) for r in sweep("good", shapes=shapes[:2], seed=seed)]
+    results += [
+        failed(
+            "good", s, reason=f"ValueError: expected 3 rounds of {s}, got {i}\nfile.py:1", seed=0
+        )
+        for i, s in enumerate(shapes[2:5])
+    ]
+    results += [failed("good", shapes[2], reason="OSError: no", seed=1)]
+    text = page_of(builder, results, tmp_path)
+    known = data_of(text)["LASA-26-reproduction"]["good"]
+    assert known["missing"] == [
+        [
+            "failed",
+            f"3 cells: {', '.join(shapes[2:5])} (seed 0)\nValueError: expected 3 rounds of "
+            f"{shapes[2]}, got 0\nfile.py:1\nThe others' reasons read alike.",
+        ],
+        ["failed", f"1 cell: {shapes[2]} (seed 1)\nOSError: no"],
+        [
+            "never run",
+            f"44 cells: {', '.join(shapes[3:5])} (seed 1); {', '.join(shapes[5:])} (seeds 0, 1)",
+        ],
+    ]
 
 
 def test_intervals_of_a_motion_are_over_demonstrations_or_else_over_seeds(builder, tmp_path):
@@ -177,6 +240,14 @@ def test_incomplete_methods_are_no_part_of_the_cards_comparison_and_are_named(bu
     assert "Good is the better one with 100 % probability" in card
     assert "Not compared here, since incomplete: Easy (3 of 26)." in card
     assert "of what was run: Easy 3 of 26 cells" in text
+
+
+def test_what_is_not_ranked_has_no_rank_and_is_named(builder, tmp_path):
+    results = sweep("good", 2.0) + sweep("bad", 3.0) + sweep("easy", 1.0, shapes=SINGLE_MOTIONS[:3])
+    text = page_of(builder, results, tmp_path)
+    assert row_of(text, "easy")["rank"] == "–"
+    assert row_of(text, "good")["rank"] == "<strong>1.00</strong>"
+    assert "environments: Easy (on 3 of 26 environments)." in text
 
 
 def test_a_trial_says_so_when_it_is_opened(builder, tmp_path):

@@ -15,10 +15,18 @@ import pytest
 
 from iflow_gym.baselines import registry
 from iflow_gym.baselines.registry import METHODS, UnknownNameError, load_method
-from iflow_gym.baselines.runner import fingerprint, plan, presets
+from iflow_gym.baselines.runner import fingerprint, plan, presets, report
 from iflow_gym.baselines.runner.fingerprint import method_code
-from iflow_gym.baselines.runner.presets import PRESETS, PresetError, load_preset
+from iflow_gym.baselines.runner.presets import (
+    PRESETS,
+    PresetError,
+    load_preset,
+    load_settings,
+)
+from iflow_gym.baselines.runner.scoring import failed_result
 from iflow_gym.datasets.lasa import MULTI_MODELS, SINGLE_MOTIONS
+from iflow_gym.metrics import metrics_of
+from iflow_gym.results import write_result
 
 ROOT = Path(__file__).parents[1]
 
@@ -308,6 +316,49 @@ def test_a_batch_does_not_depend_on_the_order_nor_on_what_is_up_to_date(make_cel
     assert [job.cells for job in jobs] == [(cells[0], cells[7]), (cells[20],)]
     for job in jobs:
         assert job.batch == whole[job.cells[0].path]
+
+
+@pytest.mark.parametrize(
+    ("made_by", "run_by", "done"),
+    [
+        ("smoke", "smoke", True),
+        ("smoke", "standard", False),
+        ("smoke", "full", False),
+        ("standard", "smoke", True),
+        ("standard", "full", True),
+    ],
+)
+def test_a_trials_record_is_done_again_by_another_preset(
+    make_cells, tmp_path, made_by, run_by, done
+):
+    """Though its key is the same where smoke leaves the settings alone."""
+    (made, *_), (wanted, *_) = (make_cells(LASA[:1], preset=p) for p in (made_by, run_by))
+    assert made.key == wanted.key
+    failed = failed_result(made, "made up")
+    write_result(tmp_path, failed)
+    assert not plan.is_up_to_date(wanted, tmp_path)
+    metrics = {metric.name: 0.5 for metric in metrics_of("goal")}
+    write_result(tmp_path, dataclasses.replace(failed, status="ok", reason=None, metrics=metrics))
+    assert plan.is_up_to_date(wanted, tmp_path) == done
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [([0.00034, None], "0.34 ms"), ([0.5, 0.25], "0.375"), ([0.0], "0"), ([None], "-")],
+)
+def test_short_times_are_told_in_milliseconds(values, text):
+    assert report._mean_seconds(values) == text
+
+
+def test_a_trial_of_other_settings_has_another_key():
+    settings = {preset: load_settings("bc", preset, registered=True) for preset in PRESETS}
+    assert settings["smoke"] != settings["standard"] == settings["full"]
+    smoke, standard = (
+        keys("bc", preset, protocols=("reproduction",), environments=(LASA[0],))
+        for preset in ("smoke", "standard")
+    )
+    assert smoke.keys() == standard.keys()
+    assert not set(smoke.values()) & set(standard.values())
 
 
 def test_the_company_in_a_batch_is_in_the_key_and_only_where_there_are_batches(make_cells):

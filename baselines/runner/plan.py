@@ -50,6 +50,9 @@ have the same to do, and what a failure in a batch costs stays bounded. Training
 in another company, which scores show, so that batches depend on the selected environments alone:
 not on the number of workers, nor on what is up to date."""
 
+TRIAL = "smoke"
+"""The preset whose records are no scores to quote."""
+
 MOST_NAMED = 6
 """Environments that a message names one by one."""
 
@@ -385,11 +388,17 @@ def not_learned(entries: Iterable[Entry], environments: Sequence[str]) -> dict[s
 
 
 def is_up_to_date(cell: Cell, folder: Path) -> bool:
-    """Whether a cell has scores under its key; a failed one is to be tried again."""
+    """Whether a cell has scores under its key; a failed one is to be tried again.
+
+    So is one of the smoke preset in a run of another. Settings that smoke leaves alone give it the
+    same key and the same scores, but its record would go on to say that it is of a trial.
+    """
     try:
         found = read_result(folder / cell.path)
     except (FileNotFoundError, ResultFileError):
         return False  # what cannot be read is written anew
+    if found.preset == TRIAL != cell.preset:
+        return False
     return found.ok and found.key == cell.key and what_is_broken(cell, folder) is None
 
 

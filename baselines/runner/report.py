@@ -163,10 +163,19 @@ def summary(results: Sequence[Result]) -> Table:
             protocol,
             f"{len(good)}/{len(group)}",
             *(_mean([r.metrics.get(name) for r in good]) for name in COLUMNS),
-            _mean([r.metrics.get("fit_seconds") for r in good]),
-            _mean([r.fit.get("evaluate_seconds") for r in good]),
+            _mean_seconds([r.metrics.get("fit_seconds") for r in good]),
+            _mean_seconds([r.fit.get("evaluate_seconds") for r in good]),
         )
     return table
+
+
+def _mean_seconds(values: Sequence[float | None]) -> str:
+    """Return a mean in seconds, or with its unit below a millisecond."""
+    text = _mean(values)
+    if text == "-" or not 0 < float(text) < 1e-3:
+        return text
+    milliseconds = _mean([None if v is None else 1e3 * v for v in values])
+    return f"{milliseconds} ms"
 
 
 def _mean(values: Sequence[float | None]) -> str:

@@ -200,8 +200,11 @@
   }
   function list(pairs, many = false) {
     const made = element("dl", undefined, { class: many ? "facts many" : "facts" });
-    for (const [term, text] of pairs) {
-      const pair = [element("dt", term), element("dd", text)];
+    for (const [term, text, address] of pairs) {
+      const pair = [element("dt", term), element("dd", address ? undefined : text)];
+      if (address) {
+        pair[1].append(element("a", text, { href: address, target: "_blank", rel: "noopener" }));
+      }
       if (many) {
         const together = element("div");
         together.append(...pair);
@@ -235,7 +238,7 @@
     if (known.missing.length) made.append(list(known.missing));
     else made.append(element("p", "None: every cell has scores."));
     if (known.settings.length) made.append(element("h4", "Settings"), list(known.settings, true));
-    made.append(element("h4", "Every motion"));
+    made.append(element("h4", "Every motion that was run"));
     made.append(element("p",
       "Means over the seeds. Below: 95 % bootstrap interval over the demonstrations; of what has " +
       "one number a cell, the least and the greatest of the seeds.", { class: "footnote" }));
@@ -258,6 +261,7 @@
     }
     scroll.append(table);
     made.append(scroll);
+    watch(scroll);
     return made;
   }
   function fit() {
@@ -267,6 +271,26 @@
     }
   }
   addEventListener("resize", fit);
+
+  // What is wider than its place says so above, and fades out where there is more of it.
+  const sizes = new ResizeObserver((entries) => {
+    const areas = new Set(entries.map((entry) => entry.target.closest(".scroll")));
+    requestAnimationFrame(() => areas.forEach(hint));
+  });
+  function watch(area) {
+    const line = element("p", "Scroll sideways for the rest \u2192", { class: "sideways" });
+    line.hidden = true;
+    area.before(line);
+    area.addEventListener("scroll", () => hint(area), { passive: true });
+    sizes.observe(area);
+    for (const child of area.children) sizes.observe(child);
+  }
+  function hint(area) {
+    const rest = area.scrollWidth - area.clientWidth;
+    area.previousElementSibling.hidden = rest <= 1;
+    area.classList.toggle("more", rest - area.scrollLeft > 1);
+  }
+  for (const area of document.querySelectorAll(".scroll")) watch(area);
 
   // Why a guarantee is what it is.
   const reason = document.getElementById("reason");
