@@ -328,11 +328,21 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
     preset's name or its time limit.
 
     Methods that do not learn motions that repeat have no cells there, and sets of one recording
-    have none under a protocol that holds some out.
+    have none under a protocol that holds some out. A seed that is named twice counts once.
+
+    Raises
+    ------
+    PresetError
+        If there is no seed or a negative one, or no time limit above 0.
     """
+    if not preset.seeds or min(preset.seeds) < 0:
+        raise PresetError(f"Expected seeds that are integers >= 0, got {list(preset.seeds)}.")
+    if not preset.time_limit > 0:
+        raise PresetError(f"Expected a time limit above 0 s, got {preset.time_limit}.")
+    distinct = tuple(dict.fromkeys(preset.seeds))
     cells = []
     for entry in entries:
-        seeds = preset.seeds if entry.stochastic else preset.seeds[:1]
+        seeds = distinct if entry.stochastic else distinct[:1]
         used = {name: entry.versions.get(name) for name in (*CORE_LIBRARIES, *entry.libraries)}
         learned = [e for e in environments if motion_of(task_of(e)) in entry.motions]
         for protocol, seed, batch in product(
