@@ -35,13 +35,13 @@ from iflow_gym.baselines.runner.fingerprint import (
     versions,
 )
 from iflow_gym.baselines.runner.presets import Preset, PresetError, load_settings
-from iflow_gym.baselines.runner.store import model_is_whole
+from iflow_gym.baselines.runner.store import cannot_write, model_is_whole
 from iflow_gym.datasets.lasa import MULTI_MODELS
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.evaluate import motion_of
 from iflow_gym.metrics import Motion, metrics_hash
 from iflow_gym.registration import POINT_MASS_ID, matching_ids, registered_ids
-from iflow_gym.results import ResultFileError, read_result, result_path, short_name
+from iflow_gym.results import Result, ResultFileError, read_result, result_path, short_name
 from iflow_gym.system import Method
 
 BATCH_SIZE = 15
@@ -395,18 +395,39 @@ def not_learned(entries: Iterable[Entry], environments: Sequence[str]) -> dict[s
 
 
 def is_up_to_date(cell: Cell, folder: Path) -> bool:
-    """Whether a cell has scores under its key; a failed one is to be tried again."""
+    """Whether a cell has scores under its key; a failed one is to be tried again.
+
+    Raises
+    ------
+    CannotWriteError
+        If there is a record that may not be read, or a folder in its place.
+    """
     try:
-        found = read_result(folder / cell.path)
+        found = _read(folder, cell)
     except (FileNotFoundError, ResultFileError):
         return False  # what cannot be read is written anew
     return found.ok and found.key == cell.key and what_is_broken(cell, folder) is None
 
 
-def what_is_broken(cell: Cell, folder: Path) -> str | None:
-    """Say what is wrong with the files of a cell that has a record; None if nothing is."""
+def _read(folder: Path, cell: Cell) -> Result:
     try:
-        found = read_result(folder / cell.path)
+        return read_result(folder / cell.path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:  # what is in the way of reading it is in the way of writing it anew
+        raise cannot_write(error, folder) from error
+
+
+def what_is_broken(cell: Cell, folder: Path) -> str | None:
+    """Say what is wrong with the files of a cell that has a record; None if nothing is.
+
+    Raises
+    ------
+    CannotWriteError
+        If there is a record that may not be read, or a folder in its place.
+    """
+    try:
+        found = _read(folder, cell)
     except FileNotFoundError:
         return None
     except ResultFileError as error:
