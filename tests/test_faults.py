@@ -20,7 +20,13 @@ from iflow_gym import results
 from iflow_gym.baselines import run_all
 from iflow_gym.baselines.run_all import RunOptions
 from iflow_gym.baselines.runner.lock import LOCK_NAME, FolderInUseError, output_lock
-from iflow_gym.baselines.runner.store import CannotWriteError, model_is_whole, no_room, store
+from iflow_gym.baselines.runner.store import (
+    CannotWriteError,
+    cannot_write,
+    model_is_whole,
+    no_room,
+    store,
+)
 from iflow_gym.results import read_result, read_results
 
 ONE = MOTIONS[:1]
@@ -28,12 +34,14 @@ ONE = MOTIONS[:1]
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_a_run_that_is_killed_leaves_no_workers_and_the_next_one_goes_on(toys, tmp_path):  # noqa: F811
-    output = tmp_path / "results"
+    output, scratch = tmp_path / "results", tmp_path / "scratch"
+    scratch.mkdir()
     (toys / "sleep-Toy-C").touch()
     command = ["--preset", "smoke", "--jobs", "1", "--methods", "toys:Toy", "--envs", *MOTIONS]
     process = subprocess.Popen(
         [sys.executable, ROOT / "baselines" / "run_all.py", *command, "--output", output],
         cwd=toys,
+        env={**os.environ, "TMPDIR": str(scratch)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -42,9 +50,11 @@ def test_a_run_that_is_killed_leaves_no_workers_and_the_next_one_goes_on(toys, t
         time.sleep(0.1)
     workers = psutil.Process(process.pid).children(recursive=True)
     assert workers
+    assert list(scratch.glob("iflow-gym-run-*"))
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert psutil.wait_procs(workers, timeout=30)[1] == []
+    assert not list(scratch.glob("iflow-gym-run-*"))
     assert (output / LOCK_NAME).exists()  # nobody took leave
     (output / "toy" / "Toy-C-v0.reproduction.seed0.json.1.partial").write_text("{")
     done = read_results(output)
@@ -123,6 +133,38 @@ def test_on_a_disk_that_fills_up_what_was_written_stays(toys, tmp_path):  # noqa
         assert "3 cells, 1 up to date, 2 to do" in text
     finally:
         subprocess.run(["umount", str(output)], check=True)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "is_folder", "message"),
+    [
+        (LOCK_NAME, True, "Is a directory"),
+        ("toy", False, "Not a directory"),
+        ("toy/Toy-A-v0.reproduction.seed0.json", True, "Is a directory"),
+    ],
+)
+def test_what_is_in_the_way_of_a_record_is_named_before_anything_is_fitted(
+    toys,  # noqa: F811
+    tmp_path,
+    obstacle,
+    is_folder,
+    message,
+):
+    output = tmp_path / "results"
+    path = output / obstacle
+    path.parent.mkdir(parents=True)
+    path.mkdir() if is_folder else path.touch()
+    with pytest.raises(CannotWriteError, match=f"{message}: .*move it away") as refused:
+        run(output, "toys:Toy", envs=ONE, jobs=1)
+    assert str(path) in str(refused.value)
+    assert not list(output.rglob("*.safetensors"))
+
+
+def test_a_disk_says_where_it_is_full_and_a_right_that_lacks_how_to_go_on(tmp_path):
+    full = cannot_write(OSError(errno.ENOSPC, "No space left on device"), tmp_path)
+    assert str(full) == f"OSError: [Errno 28] No space left on device, in {tmp_path}"
+    refused = cannot_write(PermissionError(errno.EACCES, "Permission denied", "a/.lock"), tmp_path)
+    assert "Permission denied: 'a/.lock'; you need the right to read and write" in str(refused)
 
 
 def test_a_record_and_its_model_change_together_or_not_at_all(toys, tmp_path, monkeypatch):  # noqa: F811

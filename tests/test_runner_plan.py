@@ -236,6 +236,23 @@ def test_a_method_without_randomness_runs_with_one_seed(make_toy):
     assert {seed for _, _, seed in keys(make_toy("toy_fixed"), "full")} == {0}
 
 
+def test_seeds_and_time_limits_that_are_none_are_refused_and_a_seed_counts_once(make_toy):
+    entries = plan.select_entries([make_toy("toy_seeds", stochastic=True)], "smoke")
+    environments = plan.select_environments(["LASA-Line-v0"])
+    preset = dataclasses.replace(load_preset("smoke"), protocols=("reproduction",))
+
+    def cells(**changes):
+        return plan.make_cells(entries, environments, dataclasses.replace(preset, **changes))
+
+    for seeds in ((-1,), (0, -2), ()):
+        with pytest.raises(PresetError, match=r"Expected seeds that are integers >= 0, got \["):
+            cells(seeds=seeds)
+    for limit in (0.0, -1.0, float("nan")):
+        with pytest.raises(PresetError, match=f"Expected a time limit above 0 s, got {limit}"):
+            cells(time_limit=limit)
+    assert [c.seed for c in cells(seeds=(3, 0, 3), time_limit=float("inf"))] == [3, 0]
+
+
 def test_code_settings_and_libraries_change_a_key_and_comments_do_not(make_toy, monkeypatch):
     target = make_toy("toy_code")
     before = keys(target)
@@ -447,4 +464,7 @@ def test_the_command_line_explains_itself_and_refuses_in_a_line(tmp_path):
     refused = run("--methods", "liner", "--output", "results")
     assert refused.returncode == 2
     assert refused.stderr.startswith("run_all.py: Unknown method 'liner'. Did you mean linear")
+    negative = run("--methods", "linear", "--seeds", "-1", "--output", "results")
+    assert negative.returncode == 2
+    assert negative.stderr == "run_all.py: Expected seeds that are integers >= 0, got [-1].\n"
     assert not (tmp_path / "results").exists()

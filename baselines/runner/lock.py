@@ -11,6 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
+from iflow_gym.baselines.runner.store import cannot_write
+
 LOCK_NAME = ".lock"
 """Name of the file, in the folder of results, that a run holds."""
 
@@ -21,12 +23,19 @@ class FolderInUseError(RuntimeError):
 
 @contextlib.contextmanager
 def output_lock(folder: Path) -> Iterator[None]:
-    """Hold a folder of results for this process; raise FolderInUseError if another one does.
+    """Hold a folder of results for this process.
 
     The lock is the operating system's (`flock`), on a file that names its holder. It goes with the
     process, however that ends: what a killed run leaves is a file that nobody holds, and the next
     run takes it. Folders that machines share are covered as far as their file system carries
     `flock` across, as NFS does on Linux. Without `fcntl`, on Windows, nothing is locked.
+
+    Raises
+    ------
+    FolderInUseError
+        If another process holds it.
+    CannotWriteError
+        If it cannot be written into.
     """
     try:
         import fcntl
@@ -35,7 +44,10 @@ def output_lock(folder: Path) -> Iterator[None]:
         return
     path = folder / LOCK_NAME
     while True:
-        file = path.open("a+", encoding="utf-8")
+        try:
+            file = path.open("a+", encoding="utf-8")
+        except OSError as error:
+            raise cannot_write(error, folder) from error
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

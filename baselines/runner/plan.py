@@ -35,13 +35,13 @@ from iflow_gym.baselines.runner.fingerprint import (
     versions,
 )
 from iflow_gym.baselines.runner.presets import Preset, PresetError, load_settings
-from iflow_gym.baselines.runner.store import model_is_whole
+from iflow_gym.baselines.runner.store import cannot_write, model_is_whole
 from iflow_gym.datasets.lasa import MULTI_MODELS
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.evaluate import motion_of
 from iflow_gym.metrics import Motion, metrics_hash
 from iflow_gym.registration import POINT_MASS_ID, matching_ids, registered_ids
-from iflow_gym.results import ResultFileError, read_result, result_path, short_name
+from iflow_gym.results import Result, ResultFileError, read_result, result_path, short_name
 from iflow_gym.system import Method
 
 BATCH_SIZE = 15
@@ -331,11 +331,21 @@ def make_cells(entries: Iterable[Entry], environments: Sequence[str], preset: Pr
     preset's name or its time limit.
 
     Methods that do not learn motions that repeat have no cells there, and sets of one recording
-    have none under a protocol that holds some out.
+    have none under a protocol that holds some out. A seed that is named twice counts once.
+
+    Raises
+    ------
+    PresetError
+        If there is no seed or a negative one, or no time limit above 0.
     """
+    if not preset.seeds or min(preset.seeds) < 0:
+        raise PresetError(f"Expected seeds that are integers >= 0, got {list(preset.seeds)}.")
+    if not preset.time_limit > 0:
+        raise PresetError(f"Expected a time limit above 0 s, got {preset.time_limit}.")
+    distinct = tuple(dict.fromkeys(preset.seeds))
     cells = []
     for entry in entries:
-        seeds = preset.seeds if entry.stochastic else preset.seeds[:1]
+        seeds = distinct if entry.stochastic else distinct[:1]
         used = {name: entry.versions.get(name) for name in (*CORE_LIBRARIES, *entry.libraries)}
         learned = [e for e in environments if motion_of(task_of(e)) in entry.motions]
         for protocol, seed, batch in product(
@@ -392,9 +402,14 @@ def is_up_to_date(cell: Cell, folder: Path) -> bool:
 
     So is one of the smoke preset in a run of another. Settings that smoke leaves alone give it the
     same key and the same scores, but its record would go on to say that it is of a trial.
+
+    Raises
+    ------
+    CannotWriteError
+        If there is a record that may not be read, or a folder in its place.
     """
     try:
-        found = read_result(folder / cell.path)
+        found = _read(folder, cell)
     except (FileNotFoundError, ResultFileError):
         return False  # what cannot be read is written anew
     if found.preset == TRIAL != cell.preset:
@@ -402,10 +417,25 @@ def is_up_to_date(cell: Cell, folder: Path) -> bool:
     return found.ok and found.key == cell.key and what_is_broken(cell, folder) is None
 
 
-def what_is_broken(cell: Cell, folder: Path) -> str | None:
-    """Say what is wrong with the files of a cell that has a record; None if nothing is."""
+def _read(folder: Path, cell: Cell) -> Result:
     try:
-        found = read_result(folder / cell.path)
+        return read_result(folder / cell.path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:  # what is in the way of reading it is in the way of writing it anew
+        raise cannot_write(error, folder) from error
+
+
+def what_is_broken(cell: Cell, folder: Path) -> str | None:
+    """Say what is wrong with the files of a cell that has a record; None if nothing is.
+
+    Raises
+    ------
+    CannotWriteError
+        If there is a record that may not be read, or a folder in its place.
+    """
+    try:
+        found = _read(folder, cell)
     except FileNotFoundError:
         return None
     except ResultFileError as error:

@@ -135,6 +135,7 @@ class Pool:
             executor = ProcessPoolExecutor(
                 max_workers=min(n_workers, len(jobs)),
                 initializer=prepare_worker,
+                initargs=(Path(scratch),),
                 env=dict.fromkeys(THREAD_VARIABLES, str(THREADS)),
             )
             try:

@@ -19,6 +19,20 @@ class CannotWriteError(RuntimeError):
     """Results cannot be written; what was written before is whole."""
 
 
+def cannot_write(error: OSError, folder: Path) -> CannotWriteError:
+    """Return the error that says what keeps results from being written, and into which folder.
+
+    Of a full disk the system names no file.
+    """
+    named = "" if error.filename is not None else f", in {folder}"
+    remedy = ""
+    if isinstance(error, PermissionError):
+        remedy = "; you need the right to read and write there, or another --output"
+    elif isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
+        remedy = "; move it away, or give another --output"
+    return CannotWriteError(f"{type(error).__name__}: {error}{named}{remedy}")
+
+
 def no_room(error: BaseException | None) -> bool:
     """Whether an error, or what it was raised from, is that of a disk without room."""
     while error is not None:

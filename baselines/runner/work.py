@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import signal
 import threading
 import time
@@ -28,7 +29,7 @@ from iflow_gym.baselines.runner.scoring import (
     scored,
     scored_reference,
 )
-from iflow_gym.baselines.runner.store import CannotWriteError, no_room, store
+from iflow_gym.baselines.runner.store import CannotWriteError, cannot_write, no_room, store
 from iflow_gym.metrics import get_metric
 from iflow_gym.partial_fits import PartialFitError
 from iflow_gym.results import Result, read_result, write_result
@@ -72,29 +73,33 @@ class Journal:
             file.write(line)
 
 
-def prepare_worker() -> None:
+def prepare_worker(scratch: Path) -> None:
     """Leave Ctrl-C to the parent process and keep numerical libraries to one thread.
+
+    The scratch folder of the run is removed for a parent that can no longer do it.
 
     The environment variables that say the same were set before the worker began; torch reads them.
     """
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    end_with_parent(scratch)
     threadpool_limits(THREADS)
 
 
-def end_with_parent() -> None:
+def end_with_parent(scratch: Path | None = None) -> None:
     """End this process soon after the one that began it, however that ended.
 
     A parent that is killed (`kill -9`, or for want of memory) takes no leave of its workers, which
-    would go on, or wait for ever.
+    would go on, or wait for ever. Nor does it remove its scratch folder: this process then does.
     """
     parent = os.getppid()
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(PARENT_SECONDS)
+        if scratch is not None:
+            shutil.rmtree(scratch, ignore_errors=True)
         os._exit(1)
 
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()
@@ -122,6 +127,7 @@ def run_job(number: int, job: Job, folder: Path, journal: Journal) -> None:
         limit = cell.time_limit
         began = _clocks()
         path = str(cell.path)
+        place = scratch
         journal.write("begin", label=cell.label, number=number, path=path, limit=limit)
         try:
             result = _attempt(cell, fits.get(cell.path), scratch)
@@ -133,9 +139,10 @@ def run_job(number: int, job: Job, folder: Path, journal: Journal) -> None:
             model = None
             if result.model is not None:
                 model = (scratch / cell.path).with_name(result.model).read_bytes()
+            place = folder
             store(folder, result, model)
         except OSError as error:
-            raise CannotWriteError(f"{type(error).__name__}: {error}") from error
+            raise cannot_write(error, place) from error
         said = {
             "label": cell.label,
             "method": cell.entry.name,
