@@ -20,8 +20,8 @@ depend a little on the batch: another selection of environments is another batch
 
 Exit status: 0 when every cell has scores, 1 when one failed, 2 for a name or a preset that is not
 understood, 3 where the run could not go on (the disk is full, another run writes into the folder,
-no scheduler is there), 130 after Ctrl-C. Whatever ended a run, records are whole or absent, and the
-next run goes on from there.
+no scheduler is there), 130 after Ctrl-C, 143 after SIGTERM. Whatever ended a run, records are whole
+or absent, and the next run goes on from there.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def run_all(options: RunOptions, console: Console) -> int:
     from iflow_gym.baselines.runner.lock import output_lock
     from iflow_gym.baselines.runner.presets import load_preset
     from iflow_gym.baselines.runner.report import Reporter, Spent, summary
-    from iflow_gym.baselines.runner.store import sweep
+    from iflow_gym.baselines.runner.store import cannot_write, sweep
     from iflow_gym.demonstrations import PROTOCOLS
     from iflow_gym.results import read_result
 
@@ -124,7 +124,12 @@ def run_all(options: RunOptions, console: Console) -> int:
     entries = plan.select_entries(options.methods, options.preset)
     environments = plan.select_environments(options.envs or preset.environments)
     cells = plan.make_cells(entries, environments, preset)
-    folder.mkdir(parents=True, exist_ok=True)
+    if options.json is not None and not options.json.resolve().parent.is_dir():
+        raise ValueError(f"Expected a file in a folder that exists for --json, got {options.json}.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(error, folder) from error
 
     began = time.monotonic()
     spent = Spent()
@@ -242,14 +247,16 @@ def _why_it_ended(error: RuntimeError | OSError) -> str | None:
     """Say what kept a run from going on; None for an error that has to be looked into."""
     from iflow_gym.baselines.runner.cluster_errors import ClusterError
     from iflow_gym.baselines.runner.lock import FolderInUseError
+    from iflow_gym.baselines.runner.pool import WorkersError
     from iflow_gym.baselines.runner.store import CannotWriteError, no_room
 
     if isinstance(error, CannotWriteError) or no_room(error):
+        to_do = "make room and run again" if no_room(error) else "run again then"
         return (
-            f"Results cannot be written ({error}): make room and run again. "
+            f"Results cannot be written ({error}): {to_do}. "
             "What is done is kept; the next run goes on from there."
         )
-    if isinstance(error, FolderInUseError | ClusterError):
+    if isinstance(error, FolderInUseError | ClusterError | WorkersError):
         return str(error)
     return None
 

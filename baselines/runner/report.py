@@ -83,6 +83,8 @@ class Reporter:
             elif infinite := event.get("infinite"):
                 titles = ", ".join(get_metric(name).title for name in infinite)
                 why = "a rollout ran away, or a velocity was nan or infinite"
+                if infinite == ["timing_error"]:
+                    why = "from one of the starts no hit was near a note"
                 self.line(f"{event['label']}: done, but {titles} infinite: {why}")
             elif self._progress is None:
                 self.line(
