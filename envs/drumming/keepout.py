@@ -8,9 +8,9 @@ sphere, so the cylinder is wider than the drum by its radius.
 
 With r the horizontal distance from the drum's axis, outside means above the face, r <= R and
 z >= f, or beside the wall, r >= R. Below the face and within the wall, the nearer of the two leads
-out. What a wall takes off a command it gives back upwards, up to `CLIMB`: in the wedge between a
-wall and the border of the workspace nothing would be left to slide with, and over a drum the way is
-free.
+out. Where a wall takes off of a command, the tip rises at least as fast as was taken off, up to
+`CLIMB`: over a drum the way is free, and a command that leads into a wall and down it, or into the
+wedge between a wall and the border of the workspace, would come to rest there for ever.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BRAKING_TIME: Final = 0.03
 slowed before it meets the head."""
 
 CLIMB: Final = 0.1
-"""Speed in m/s at most that a wall adds upwards."""
+"""Speed in m/s up to which a tip that is led into a wall rises."""
 
 RIM: Final = 0.007
 """How much wider than its head a drum is, in m."""
@@ -65,5 +65,5 @@ class KeepOut:
                 least, towards = -beside / BRAKING_TIME, float(out @ velocity)
                 if towards < least:
                     velocity = velocity + (least - towards) * out
-                    velocity[2] += min(least - towards, CLIMB)
+                    velocity[2] = max(velocity[2], min(least - towards, CLIMB))
         return velocity
