@@ -368,10 +368,11 @@ your own recordings on the first four sevenths; a letter has ten held out, which
 fits on the other ten. `iflow_gym.evaluate.score(system, env, seed=0, protocol="generalisation")`. A
 rollout has its recording's start and dt, and, where the motion ends, its number of samples.
 
-**Stability** is seen from a fixed grid of 16 x 16 starts (7 x 7 x 7 in space) on the recordings'
-box enlarged by half of each side at every end, over five times the longest recording, and from the
-recordings' starts with a push of 25 % of the box's diagonal at 40 % of the way. Converged means
-within 2 % of the diagonal of the goal for the whole last 5 % of that horizon.
+**Stability** is seen from a fixed grid of 16 x 16 starts (7 x 7 x 7 in space, about 256 in other
+dimensions) on the recordings' box enlarged by half of each side at every end, over five times the
+longest recording, and from the recordings' starts with a push of 25 % of the box's diagonal at 40 %
+of the recording. *Converged* means within 2 % of the diagonal of the goal for the whole last 5 % of
+that horizon.
 
 **Motions that repeat** are rolled out over eight periods; the last two are the steady orbit, which
 is compared with the recording's own samples. Attraction is seen from the same grid of starts: over
@@ -393,7 +394,9 @@ with the reason.
 **Aggregates** are interquartile means and means over environments and seeds with 95 % stratified
 bootstrap intervals (10 000 resamples): seeds are resampled within each environment; with one seed
 the environments are, and the table says so. A cell that failed is never dropped: it ranks last, and
-an aggregate without it says n of N.
+an aggregate without it says n of N. A mean rank is over the metrics of a board's accuracy table and
+over the environments that all ranked methods were run on. A method with which fewer than half of
+them would be left has no rank, and the board names it.
 {tables}"""
 
 
