@@ -147,7 +147,10 @@ FAMILIES = (
 
 # Wind
 
-{inspect.getdoc(Wind)}""",
+{inspect.getdoc(Wind)}
+
+By default `strength` is {Wind.strength}, `curl` {Wind.curl}, `reach` {Wind.reach} and `direction`
+{tuple(Wind().unit(2).tolist())}.""",
     ),
     Family(
         "drumming",
