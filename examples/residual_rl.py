@@ -4,7 +4,7 @@
 # # Residual reinforcement learning
 #
 # A field that was learned from demonstrations knows the way, and nothing of the machine that goes
-# it. Here the machine is six times heavier than its controller believes, in a wind. An agent
+# it. Here the machine is four times as heavy as its controller believes, in a wind. An agent
 # learns what to add to the field's command; once with a free hand, once behind a shield that keeps
 # the field's Lyapunov function falling, whatever the agent does.
 #
