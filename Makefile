@@ -13,7 +13,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make leaderboard   fit the baselines on LASA, score them, write leaderboard/LEADERBOARD.md"
+	@echo "make leaderboard   fit the baselines on LASA and the letters, score them, write leaderboard/LEADERBOARD.md"
 	@echo "                   (PRESET=smoke|standard|full, default standard; what is up to date is not done again)"
 	@echo "make check         check leaderboard/results: records, hashes, the board that they make"
 	@echo "make test          run the tests, the linter and the type checker"

@@ -72,6 +72,9 @@ MEMORY = (
 )
 """What `peak_memory_mb` of a record is."""
 
+RESIDUAL = "residual"
+"""Preset in the records of `baselines/residual.py`."""
+
 NOTE_LENGTH = 200
 """Characters of the longest note on a method that is in the page."""
 
@@ -688,11 +691,15 @@ def _versions(results: Sequence[Result]) -> list[str]:
 def _commands(results: Sequence[Result]) -> list[str]:
     """Return the run for each preset, naming the methods that are not in the registry."""
     known = {*METHODS, *REFERENCES}
-    foreign = sorted({r.target or r.method for r in results if r.method not in known})
+    presets = {r.preset for r in results}
+    runs = [r for r in results if r.preset != RESIDUAL]
+    foreign = sorted({r.target or r.method for r in runs if r.method not in known})
     lines = [
         f"$ python baselines/run_all.py --preset {preset} --force"
-        for preset in sorted({r.preset for r in results})
+        for preset in sorted(presets - {RESIDUAL})
     ]
     if foreign:
         lines.append(f"# and --methods {' '.join(foreign)}")
+    if RESIDUAL in presets:
+        lines.append("$ python baselines/residual.py bench --force")
     return lines

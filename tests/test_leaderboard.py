@@ -520,6 +520,15 @@ def test_where_a_method_comes_from_is_said_and_a_long_note_is_not(builder):
     assert "Where each method comes from" not in render(builder, sweep("good"))
 
 
+def test_the_commands_that_made_the_records_are_those_of_their_scripts(builder):
+    made = [*sweep("linear"), *sweep("imitation-flow+residual", preset="residual", target="m:load")]
+    text = render(builder, made)
+    assert "$ python baselines/run_all.py --preset standard --force\n" in text
+    assert "$ python baselines/residual.py bench --force\n" in text
+    assert "--preset residual" not in text
+    assert "m:load" not in text
+
+
 def test_what_memory_is_is_said(builder):
     cost = section(render(builder, sweep("good")), "Cost")
     assert "rise of the worker's resident memory" in cost
