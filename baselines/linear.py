@@ -4,7 +4,7 @@
 
 over every sample of every demonstration, a > 0 the margin: the least-squares best among the linear
 systems that decay at least that fast, not among all that are stable. The margin is a choice. At the
-default, 1.5 / mean duration, every LASA shape settles within the horizon that METRICS.md scores. A
+default, 1.5 / mean duration, every LASA shape settles within the horizon that is scored. A
 smaller one can follow the demonstrations more closely and comes late: at 0.1 the RMSE on Sharpc is
 8.71 mm instead of 10.27 mm, but on Saeghe 0.18 of the starts converge instead of 1.0.
 
@@ -56,7 +56,7 @@ class StableLinearConfig:
 
     margin: float = 1.5
     """Slowest rate of decay, in 1 / mean duration of the demonstrations: Re λ(A) <= -margin / T.
-    Below 1.5 some LASA shapes do not settle within METRICS.md's horizon; more costs accuracy."""
+    Below 1.5 some LASA shapes do not settle within the scored horizon; more costs accuracy."""
     noise_horizons: tuple[int, ...] = (1, 10)
     """Horizons in samples whose residuals, pooled, set the noise of `log_prob`, each cut to the
     length of a shorter recording; the field does not depend on it."""

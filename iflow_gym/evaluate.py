@@ -1,4 +1,4 @@
-"""Scores of a system or a policy on an environment: every number of METRICS.md but the fit's cost.
+"""Scores of a system or a policy on an environment: every metric but what a fit costs.
 
 Every trajectory that is scored is recorded from the observations of the batched environment,
 stepped with the actions of a policy; see `iflow_gym.evaluation.rollouts`.

@@ -22,7 +22,7 @@ from iflow_gym.policy import policy_of
 from iflow_gym.system import Method
 
 STARTS = 256
-"""About how many starts the grid has where METRICS.md fixes none: in 1-D, and from 4-D on."""
+"""About how many starts the grid has where no other number is fixed: in 1-D, and from 4-D on."""
 
 
 class Policy(Protocol):
