@@ -5,7 +5,8 @@
 Each count is trained in a process of its own, on LASA shapes and seeds in turn; memory is the rise
 of the process's peak over what the imports take. Milliseconds a step are of the steps between a
 quarter of them and all: both fits sweep for fast places as often, and are not trained on where they
-are loud. Seconds are extrapolated to the default number of steps, without those. With a GPU, `--device cuda` trains there; `--counts 150` is the 30 shapes with five seeds.
+are loud. Seconds are extrapolated to the default number of steps, without those. With a GPU,
+`--device cuda` trains there; `--counts 150` is the 30 shapes with five seeds.
 """
 
 import json
