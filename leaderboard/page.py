@@ -701,5 +701,8 @@ def _commands(results: Sequence[Result]) -> list[str]:
     if foreign:
         lines.append(f"# and --methods {' '.join(foreign)}")
     if RESIDUAL in presets:
-        lines.append("$ python baselines/residual.py bench --force")
+        bench = "$ python baselines/residual.py bench --force"
+        lines.append(bench)
+        if any(r.preset == RESIDUAL and r.family == "Drumming" for r in results):
+            lines.append(f"{bench} --envs Drumming-v0 --preset drumming")
     return lines

@@ -77,11 +77,11 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
     A velocity is held for a control step; the arm reaches it at the step's end, or accelerates
     towards it by 20 m/s^2. Where a joint's stop or a joint's speed limit is near, the command is
     slowed as a whole (`info["command_scale"]`), never bent; along the border of the workspace it
-    slides, and along a drum, which counts as solid from 16 mm below its head on:
-    `iflow_gym.envs.drumming.control` and `keepout` have the equations. Torques, of up to 87 N m
-    (joints 1 to 4) and 12 N m (5 to 7), come on top of the compensation of gravity; they are scaled
-    as a whole so that the joints keep their limits. A collision can make a joint faster than its
-    limit for an instant; no joint reaches its stop.
+    slides, and along a drum, which counts as solid from 16 mm below its head on, and rises at its
+    wall: `iflow_gym.envs.drumming.control` and `keepout` have the equations. Torques, of up to
+    87 N m (joints 1 to 4) and 12 N m (5 to 7), come on top of the compensation of gravity; they are
+    scaled as a whole so that the joints keep their limits. A collision can make a joint faster
+    than its limit for an instant; no joint reaches its stop.
 
     ## Observation Space
     `Box(float64)`, the parts that `observe` names, in its order; the tip comes first always.

@@ -88,8 +88,9 @@ CHORDS = 4
 """How often what is added is shortened before the base's own command is taken."""
 
 SLACK = 4.0
-"""S: how far the measured V may be above its start's before it has begun to fall. Of the disturbed
-mass under its base alone, from the starts of a scored grid, V kept within 3.4 times S = 1."""
+"""S: so many times its start's the measured V may be. Chosen by the disturbed mass on Sshape,
+seed 3: under its base alone V kept within 3.4 exp(-rho t / 2) V(x(0)) from every start of the
+scored grid, and under an agent that kept the mass from the goal it did not."""
 
 INSIDE = 1 - 1e-12
 """Commands stay this far below the speed limit, so that rounding carries none beyond it."""
