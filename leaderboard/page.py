@@ -264,10 +264,13 @@ def warnings_about(results: Sequence[Result]) -> list[str]:
 
 
 def _mixed_rows(results: Sequence[Result]) -> list[str]:
-    """Say which methods' records were made by different code, or in a preset by other settings."""
+    """Say which methods' records were made by different code, or a row's by other settings.
+
+    A row is of one family: a preset of residuals is chosen for each.
+    """
     groups: dict[tuple[str, str, str], Counter[str]] = {}
     for r in results:
-        for label, where in (("code", ""), ("config", r.preset)):
+        for label, where in (("code", ""), ("config", f"{r.preset} on {r.family}")):
             key = (escaped(r.title), label, where)
             groups.setdefault(key, Counter())[r.hashes.get(label, "none")] += 1
     what = {"code": "versions of its code", "config": "settings in the preset"}

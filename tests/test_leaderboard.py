@@ -463,6 +463,13 @@ def test_records_of_a_method_that_do_not_compare_are_warned_of(builder, label, p
         assert "23 cells by none, 3 cells by new" in text
 
 
+def test_each_family_may_have_settings_of_its_own(builder):
+    own = record("good", MULTI_MODELS[0])
+    other = record("good", MULTI_MODELS[0], hashes={**own.hashes, "config": "new"})
+    text = render(builder, [*sweep("good"), other])
+    assert "records of Good were made" not in text
+
+
 @pytest.mark.parametrize(
     ("kind", "metric", "value", "message"),
     [
