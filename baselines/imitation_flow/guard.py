@@ -175,12 +175,11 @@ class GuardedAdam:
         self.failures: dict[int, TrainingError] = {}
         self.failed = torch.zeros_like(like, dtype=torch.bool)
 
-    def step(self, step: int, stage: int, loss: Tensor, judged: Tensor | None = None) -> None:
-        """Take a step down the gradients of the loss, (m,), in a stage that numbers its kind.
+    def step(self, step: int, loss: Tensor, judged: Tensor | None = None) -> None:
+        """Take a step down the gradients of the loss, (m,).
 
         Where the loss has weights that change within a stage, what is judged is one without.
         """
-        self.begin(step, stage)
         gradients: Sequence[Tensor | None] = torch.autograd.grad(
             loss.sum(), self._parameters, allow_unused=True
         )
@@ -192,7 +191,10 @@ class GuardedAdam:
         self.descend(step, loss.detach() if judged is None else judged.detach())
 
     def begin(self, step: int, stage: int) -> None:
-        """Judge the stage before, if this is a new one; before gradients are taken."""
+        """Judge the stage before, if this is a new one: losses are of one kind within each.
+
+        To be called before the loss is taken: the judgement may take parameters back.
+        """
         if stage != self._stage:
             self.look(step)
             self._stage, self._begins = stage, True

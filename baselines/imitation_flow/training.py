@@ -291,8 +291,8 @@ class _Batch:
     def step(self, adam: GuardedAdam, step: int, stage: int) -> None:
         """Take one step of a stage."""
         weights = _weights(self._config, self.resolved, step, stage)
+        adam.begin(step, stage)
         if self._whole is not None:
-            adam.begin(step, stage)
             adam.descend(step, self._whole(weights, adam.gradients))
             return
         self._draws.new_step()
@@ -314,7 +314,7 @@ class _Batch:
             loss = loss + (calm.weight - 1) * weighted[-1]
         if inward:  # it looks for the worst states: no measure of how training goes
             judged = judged - weighted[-1]
-        adam.step(step, stage, loss, judged=judged)
+        adam.step(step, loss, judged=judged)
 
     def take(self, other: _Batch, model: int) -> None:
         """Become one model of another batch."""

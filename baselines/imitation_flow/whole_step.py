@@ -292,7 +292,7 @@ class WholeStep:
         for name, end in ends.items():
             shares = g_states[..., end, 0].reshape(m, 2, asked[name].shape[-1], -1)
             g_z[..., places[name]] = shares.sum(-1)
-        g_z[..., 0] = g_reached.sum(-1) - g_z.sum(-1)  # of the attractor
+        g_z[..., places["goal"]] = (g_reached.sum(-1) - g_z.sum(-1))[..., None]  # the attractor
         inside, g_det = self._inside(g_z), self._inside(g_log_det)
         _, _, by_inverse = kernels.inverse_gradient(
             np, inside, g_det, inverse, self._weights, self._memory

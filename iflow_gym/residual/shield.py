@@ -74,11 +74,9 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iflow_gym.demonstrations import FloatArray
-
-BoolArray = NDArray[np.bool_]
+from iflow_gym.residual.bases import BoolArray
 
 RATE_SHARE = 0.9
 """Default of the required rate, as a share of the base's own slowest. A smaller one lets the agent

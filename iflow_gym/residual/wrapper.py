@@ -12,9 +12,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from iflow_gym.demonstrations import FloatArray
+from iflow_gym.residual.bases import BoolArray
 from iflow_gym.residual.composition import SCALE, Composition, Features, starts_of
-
-BoolArray = NDArray[np.bool_]
 
 
 class ResidualActionWrapper(

@@ -86,7 +86,7 @@ def test_a_jump_late_in_a_window_is_not_kept_as_good():
     for step in range(2 * guard.WINDOW):
         if step == guard.WINDOW - 1:
             parameter.data.fill_(20.0)
-        adam.step(step, 0, parameter[:, 0] ** 2 + 1)
+        adam.step(step, parameter[:, 0] ** 2 + 1)
     assert len(adam.restarts[0]) == 1
     assert abs(parameter.item()) < 2
 
