@@ -12,7 +12,9 @@ import pytest
 import iflow_gym  # noqa: F401 (registers the environments)
 from iflow_gym import metrics
 from iflow_gym.baselines.references import NearestDemonstration, Replay, ReplayPolicy
+from iflow_gym.baselines.registry import load_method
 from iflow_gym.demonstrations import Demonstrations
+from iflow_gym.envs.guide import without_rewards
 from iflow_gym.envs.point_mass import PointMassEnv
 from iflow_gym.evaluate import FIT_COSTS, evaluate, score
 from iflow_gym.policy import DynamicalSystemPolicy
@@ -355,3 +357,18 @@ def test_a_single_demonstration_has_no_nearest_one():
         NearestDemonstration().evaluate(
             PointMassEnv(straight(n=1)), seed=0, protocol="reproduction"
         )
+
+
+@pytest.mark.parametrize("env_id", ["iflow/LASA-Sharpc-v0", "iflow/Letter-O-v0"])
+def test_scores_do_not_depend_on_rewards(env_id):
+    env = gymnasium.make(env_id)
+    system = load_method("gmr")(n_components=3).fit(env.unwrapped.demonstrations, seed=0)
+    found = evaluate(system, env, seed=0)
+    with without_rewards():
+        env.reset(seed=0)
+        assert np.isnan(env.unwrapped.step(np.zeros(2, dtype=np.float32))[1])
+        spared = evaluate(system, env, seed=0)
+    assert np.isfinite(env.step(np.zeros(2, dtype=np.float32))[1])
+    timed = {"step_us": None}
+    assert spared.metrics | timed == found.metrics | timed
+    assert spared.per_demonstration == found.per_demonstration

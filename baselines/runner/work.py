@@ -30,6 +30,7 @@ from iflow_gym.baselines.runner.scoring import (
     scored_reference,
 )
 from iflow_gym.baselines.runner.store import CannotWriteError, cannot_write, no_room, store
+from iflow_gym.envs.guide import without_rewards
 from iflow_gym.metrics import get_metric
 from iflow_gym.partial_fits import PartialFitError
 from iflow_gym.results import Result, read_result, write_result
@@ -213,12 +214,14 @@ def _attempt(cell: Cell, fitted: Fit | None, scratch: Path) -> Result:
     try:
         with _time_limit(cell.time_limit):
             if cell.entry.reference:
-                return scored_reference(cell)
+                with without_rewards():
+                    return scored_reference(cell)
             if fitted is None:
                 doing = "it was fitted"
                 fitted = fit_alone(cell)
                 doing = "it was scored"
-            return scored(cell, fitted, model)
+            with without_rewards():
+                return scored(cell, fitted, model)
     except BaseException as error:
         if no_room(error):
             raise CannotWriteError(f"{type(error).__name__}: {error}") from error
