@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from iflow_gym.baselines.elementwise import tanh_
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
 
@@ -141,8 +142,8 @@ class BehaviouralCloning(DynamicalSystem):
 
     def _velocity(self, x: FloatArray) -> FloatArray:
         w1, b1, w2, b2, w3, b3 = self.layers_
-        hidden = np.tanh((x - self.centre_) / self.length_ @ w1 + b1)
-        return self.speed_ * (np.tanh(hidden @ w2 + b2) @ w3 + b3)
+        hidden = tanh_((x - self.centre_) / self.length_ @ w1 + b1)
+        return self.speed_ * (tanh_(hidden @ w2 + b2) @ w3 + b3)
 
     @property
     def guarantee(self) -> Guarantee:

@@ -34,6 +34,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+from iflow_gym.baselines.elementwise import exp_
 from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
@@ -152,7 +153,7 @@ class GPR(DynamicalSystem):
         exponent -= self._squares
         exponent -= 0.5 * (scaled**2).sum(axis=1, keepdims=True)
         np.minimum(exponent, 0.0, out=exponent)
-        np.exp(exponent, out=exponent)
+        exp_(exponent)
         exponent *= self.signal_variance_
         return exponent
 

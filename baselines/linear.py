@@ -120,24 +120,26 @@ class StableLinear(DynamicalSystem):
         self.matrix_ = matrix
         self._goal = goal
         self.lyapunov_matrix_ = lyapunov_matrix(matrix)
-        self._propagator: tuple[float, FloatArray] = (0.0, np.eye(len(matrix)))
+        self._propagators = np.empty(0), np.empty((0, *matrix.shape))
 
     def _velocity(self, x: FloatArray) -> FloatArray:
         return np.asarray((x - self._goal) @ self.matrix_.T)
 
     def _step(self, x: FloatArray, dt: FloatArray) -> FloatArray:
-        offset = x - self._goal
-        if len(dt) and (dt == dt[0]).all():
-            return np.asarray(self._goal + offset @ self._flow(float(dt[0])).T)
-        times, which = np.unique(dt, return_inverse=True)
-        flows = expm(times[:, None, None] * self.matrix_)
-        return np.asarray(self._goal + np.einsum("nij,nj->ni", flows[which], offset))
+        flows = self._flows(dt)
+        return np.asarray(self._goal + np.einsum("nij,nj->ni", flows, x - self._goal))
 
-    def _flow(self, dt: float) -> FloatArray:
-        """Return exp(A dt); the last one is kept, since a rollout asks for it at every step."""
-        if dt != self._propagator[0]:
-            self._propagator = (dt, expm(dt * self.matrix_))
-        return self._propagator[1]
+    def _flows(self, dt: FloatArray) -> FloatArray:
+        """Return exp(A dt), (n, d, d); the last ones are kept: a rollout asks for them every step.
+
+        States that step together may have times of their own, but few different ones.
+        """
+        kept, flows = self._propagators
+        if not np.array_equal(dt, kept):
+            times, which = np.unique(dt, return_inverse=True)
+            flows = expm(times[:, None, None] * self.matrix_)[which]
+            self._propagators = dt.copy(), flows
+        return flows
 
     def _lyapunov(self, x: FloatArray) -> FloatArray:
         offset = x - self._goal

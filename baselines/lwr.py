@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from iflow_gym.baselines.elementwise import exp_
 from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
@@ -174,8 +175,7 @@ class LocalFits:
         weights = x @ self._x.T
         weights -= self._halves
         weights -= weights.max(axis=1, keepdims=True)  # the nearest sample has the weight 1
-        np.exp(weights, out=weights)
-        sums = weights @ self._moments
+        sums = exp_(weights) @ self._moments
         sums /= sums[:, :1]
         mean_x, mean_v = sums[:, 1 : 1 + d], sums[:, 1 + d : 1 + d + k]
         products = sums[:, 1 + d + k : 1 + d + k + d * d].reshape(-1, d, d)

@@ -44,13 +44,13 @@ class Controller:
         """Return f, shape (n, d), V and rho, shape (n,), and the gradient of V, shape (n, d)."""
         raw = self.regressor.velocity(x * self.length) * (self.time / self.length)
         value, gradient = self.energy.value_and_gradient(x)
-        square = (gradient * gradient).sum(axis=1)
-        distance = (x * x).sum(axis=1)
+        square = np.einsum("ni,ni->n", gradient, gradient)
+        distance = np.einsum("ni,ni->n", x, x)
         if self.rho == "paper":
             rho = -self.rho0 * np.expm1(-self.kappa0 * np.sqrt(distance))
         else:
             rho = -self.rho0 * np.expm1(-self.kappa0 * distance) * np.sqrt(square)
-        excess = np.maximum((gradient * raw).sum(axis=1) + rho, 0.0)
+        excess = np.maximum(np.einsum("ni,ni->n", gradient, raw) + rho, 0.0)
         moving = square > 0
         pull = np.where(moving, excess / np.where(moving, square, 1.0), 0.0)
         velocity = np.where(moving[:, None], raw - pull[:, None] * gradient, 0.0)

@@ -68,37 +68,49 @@ class Energy:
     def value(self, x: FloatArray) -> FloatArray:
         """Return V, shape (n,), of offsets x, shape (n, d)."""
         _, brackets = self._brackets(x)
-        return np.asarray(brackets[:, 0] + (brackets[:, 1:] ** 2).sum(axis=1))
+        return _sum(brackets)
 
     def value_and_gradient(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return V, shape (n,), and its gradient, shape (n, d)."""
         products, brackets = self._brackets(x)
-        value = brackets[:, 0] + (brackets[:, 1:] ** 2).sum(axis=1)
+        value = _sum(brackets)
         weights = 2.0 * brackets
         weights[:, 0] = 1.0
-        gradient = (weights[:, None] @ (2.0 * products - self._shifts))[:, 0]
-        return value, gradient
+        products *= 2.0
+        products -= self._shifts
+        return value, (weights[:, None] @ products)[:, 0]
 
     def pulled_back(self, x: FloatArray, level: FloatArray) -> FloatArray:
         """Return the points s x, 0 < s <= 1, with V(s x) = level, for V(x) >= level > 0.
 
         V(s x) is convex and increasing in s, so that Newton's method from s = 1 falls to the root.
         """
-        squares = ((x @ self._stacked).reshape(self._shape) @ x[:, :, None])[:, :, 0]
-        slopes = x @ self._shifts.T
+        # Terms lead here: sums over the few of them then run along memory.
+        n_terms, d = self.matrices.shape[:2]
+        columns = np.ascontiguousarray(x.T)
+        products = (self.matrices.reshape(-1, d) @ columns).reshape(n_terms, d, -1)
+        squares, slopes = (products * columns).sum(axis=1), self._shifts @ columns
         s = np.ones(len(x))
         for _ in range(NEWTON_STEPS):
-            brackets = s[:, None] * (s[:, None] * squares - slopes)
-            rates = 2.0 * s[:, None] * squares - slopes
+            reached = s * squares
+            rates = reached - slopes
+            brackets = s * rates
+            rates += reached
             np.maximum(brackets, 0.0, out=brackets)
-            weights = 2.0 * brackets
-            weights[:, 0] = 1.0
-            excess = brackets[:, 0] + (brackets[:, 1:] ** 2).sum(axis=1) - level
-            change = np.maximum(excess, 0.0) / (weights * rates).sum(axis=1)
+            terms = brackets[1:]
+            slope = rates[0] + 2.0 * (terms * rates[1:]).sum(axis=0)
+            terms *= terms
+            change = np.maximum(brackets.sum(axis=0) - level, 0.0) / slope
             s -= change
             if (change <= 1e-12 * s).all():
                 break
         return np.asarray(s[:, None] * x)
+
+
+def _sum(brackets: FloatArray) -> FloatArray:
+    """Return V, shape (n,), from the brackets where they count, shape (n, L + 1)."""
+    terms = brackets[:, 1:]
+    return np.asarray(brackets[:, 0] + np.einsum("nl,nl->n", terms, terms))
 
 
 def shifted(matrices: FloatArray, centres: FloatArray) -> FloatArray:
