@@ -225,10 +225,13 @@ class GuardedAdam:
         if self._count == WINDOW:
             self.look(step)
 
-    def finish(self, step: int) -> None:
-        """Look once more; a stage that ends worse than it began is a failure."""
+    def finish(self, step: int, tolerance: float = 1.0) -> None:
+        """Look once more; a stage that ends worse than it began is a failure.
+
+        Worse by the loss it began with, or 1 if that is less, times the tolerance.
+        """
         self.look(step)
-        worse = self._kept > self._first + self._first.abs().clamp_min(1.0)
+        worse = self._kept > self._first + tolerance * self._first.abs().clamp_min(1.0)
         for i in (worse & ~self.failed).nonzero()[:, 0].tolist():
             self._fail(
                 i,

@@ -44,6 +44,7 @@ from iflow_gym.baselines.imitation_flow.data import Draws, Recordings, Task
 from iflow_gym.baselines.imitation_flow.emissions import make_flow
 from iflow_gym.baselines.imitation_flow.flow import Flow
 from iflow_gym.baselines.imitation_flow.guard import (
+    TOLERANCE,
     Adam,
     GuardedAdam,
     Restart,
@@ -206,7 +207,7 @@ def _train_batch(
         batch.step(adam, step, _stage(config, step, batch.data))
         if len(adam.failures) == len(tasks):
             return [adam.failures[m] for m in range(len(tasks))]
-    adam.finish(n_steps)
+    adam.finish(n_steps, TOLERANCE if batch.bends else 1.0)
     calmness: list[Calmness | None] = [None] * len(tasks)
     if calm is not None:
         speeds = calm.watch(batch.flow, batch.latent, N_SWEEPS)
@@ -269,6 +270,11 @@ class _Batch:
     def watched(self) -> Calm | None:
         """The calm of motions that end, whose weight grows with need."""
         return None if self.data.cyclic else self._calm
+
+    @property
+    def bends(self) -> bool:
+        """Whether the last stage bends the way back inwards, at the cost of what is judged."""
+        return self._inward is not None and self._orbit is not None
 
     @property
     def parameters(self) -> list[tuple[nn.Parameter, int]]:

@@ -96,6 +96,21 @@ def test_an_end_that_is_worse_than_the_beginning_is_an_error():
         ImitationFlow(n_steps=300, learning_rate=1e8, **SMALL).fit(load_lasa("Angle"), seed=0)
 
 
+@pytest.mark.parametrize(("tolerance", "failed"), [(1.0, True), (guard.TOLERANCE, False)])
+def test_a_stage_may_end_worse_by_its_tolerance(tolerance, failed):
+    """What is judged rises from 0.5 to 3 where a penalty that is not judged pulls."""
+    parameter = torch.nn.Parameter(torch.ones(1, 1))
+    adam = guard.GuardedAdam(
+        [(parameter, 0)], ["toy"], n_steps=100, learning_rate=1e-3, max_norm=1.0
+    )
+    for step in range(100):
+        judged = torch.full((1,), 0.5 if step == 0 else 3.0)
+        adam.step(step, parameter[:, 0] ** 2, judged=judged)
+    adam.finish(100, tolerance)
+    assert not adam.restarts[0]
+    assert bool(adam.failures) is failed
+
+
 def test_training_that_diverges_for_good_is_an_error_that_holds_the_others(monkeypatch):
     """They are the same bits as without it, and come back from the error as they would without."""
     undisturbed = fit(n_steps=400)
