@@ -114,25 +114,6 @@ class Guide(ABC):
         """Return the reward of a step that ends at a distance from the aim."""
         if not _rewarded.get():
             return distance * math.nan
-        return self._reward(ops, self._progress(ops, x, x_next, dt), distance)
-
-    @abstractmethod
-    def _reward(
-        self,
-        ops: Arithmetic[Component],
-        progress: tuple[Component, Component, Component],
-        distance: Component,
-    ) -> Component:
-        """Return the reward of what `_progress` found."""
-
-    def _progress(
-        self,
-        ops: Arithmetic[Component],
-        x: Sequence[Component],
-        x_next: Sequence[Component],
-        dt: Component,
-    ) -> tuple[Component, Component, Component]:
-        """Return <u, n> dt, the longer of the step and the demonstrated one, and the latter."""
         d = len(x)
         middle = [(a + b) * 0.5 for a, b in zip(x, x_next, strict=True)]
         row = self._nearest.of(ops, middle)
@@ -141,7 +122,20 @@ class Guide(ABC):
         shown = row[d] * dt
         pace = ops.largest(ops.root(dot(step, step)), shown)
         norm = ops.largest(ops.root(dot(guide, guide)), _TINY)
-        return dot(step, guide) / norm, pace, shown
+        made = dot(step, guide) / norm
+        reward: Component = self._reward(ops, made, pace, shown, distance)
+        return reward
+
+    @abstractmethod
+    def _reward(
+        self,
+        ops: Arithmetic[Component],
+        made: Component,
+        pace: Component,
+        shown: Component,
+        distance: Component,
+    ) -> Component:
+        """Return the reward, given <u, n> dt, the longer of step and shown step, and the latter."""
 
 
 class GoalGuide(Guide):
@@ -161,11 +155,12 @@ class GoalGuide(Guide):
     def _reward(
         self,
         ops: Arithmetic[Component],
-        progress: tuple[Component, Component, Component],
+        made: Component,
+        pace: Component,
+        shown: Component,
         distance: Component,
     ) -> Component:
         """Return 1 at the goal."""
-        made, pace, _ = progress
         share = ops.largest(ops.smallest(made / pace, 1.0), -1.0)
         return ops.select(distance <= self.tolerance, 1.0, share)
 
@@ -212,11 +207,12 @@ class CycleGuide(Guide):
     def _reward(
         self,
         ops: Arithmetic[Component],
-        progress: tuple[Component, Component, Component],
+        made: Component,
+        pace: Component,
+        shown: Component,
         distance: Component,
     ) -> Component:
         """Return what pays most at the demonstrated tempo."""
-        made, pace, shown = progress
         return ops.largest(ops.smallest(made * shown / (pace * pace), 1.0), -1.0)
 
     def _samples(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -251,8 +251,9 @@ class _Batch:
         if resolved.calm_weight and config.objective == "reproduction":
             sampling = CALM_CYCLES if data.cyclic else CALM_ENDS
             self._calm = Calm(data, sampling, config.calm_speed)
+        held = _stage(config, resolved.n_steps, data) == ORBIT
         self._orbit: MeanOrbit | None = None
-        if data.cyclic and resolved.orbit_weight > 0:
+        if held:
             self._orbit = MeanOrbit(tasks, data, config.orbit_resolution)
         self._whole: WholeStep | None = None
         if by_hand(config, tasks[0], device):
@@ -263,7 +264,7 @@ class _Batch:
             prepared = Preparation(config, data, rngs, *looked_at)
             self._whole = WholeStep(self.flow, self.latent, data, self._calm, prepared, config)
         self._inward: Inward | None = None
-        if data.cyclic and resolved.inward_weight > 0:
+        if held and resolved.inward_weight > 0:
             self._inward = Inward(data)
 
     @property
@@ -274,7 +275,7 @@ class _Batch:
     @property
     def bends(self) -> bool:
         """Whether the last stage bends the way back inwards, at the cost of what is judged."""
-        return self._inward is not None and self._orbit is not None
+        return self._inward is not None
 
     @property
     def parameters(self) -> list[tuple[nn.Parameter, int]]:

@@ -1,0 +1,69 @@
+"""A batch of LWR, GPR and BC with torch's exp and tanh, and with NumPy's: medians in one run.
+
+    OMP_NUM_THREADS=1 python benchmarks/elementwise.py [--n-states 263]
+
+Which is faster depends on the processor: NumPy's exp and tanh of doubles use AVX-512, and without
+it no vector instructions. Velocities by both are compared, too.
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from unittest.mock import patch
+
+import numpy as np
+import tyro
+
+from iflow_gym import load_lasa
+from iflow_gym.baselines import behavioural_cloning as bc
+from iflow_gym.baselines import gpr, lwr
+from iflow_gym.demonstrations import FloatArray
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    n_states: int = 263
+    """States of a batch; 263 are what a shape's stability is scored with."""
+    repeats: int = 200
+    """Timings of each, in turn; the median is reported."""
+
+
+def numpys(function: Callable[..., FloatArray]) -> Callable[[FloatArray], FloatArray]:
+    """Return a function of NumPy as one that works in place."""
+    return lambda values: function(values, out=values)
+
+
+def main(options: Options) -> None:
+    """Measure and print."""
+    motion = load_lasa("Angle")
+    rng = np.random.default_rng(0)
+    low, high = motion.bounding_box
+    states = rng.uniform(low, high, size=(options.n_states, motion.n_dims))
+    print(f"{options.n_states} states{'':13}torch us   NumPy us   ratio   difference")
+    for module, system, name, function in (
+        (lwr, lwr.LWR(), "exp_", np.exp),
+        (gpr, gpr.GPR(), "exp_", np.exp),
+        (bc, bc.BehaviouralCloning(n_steps=100), "tanh_", np.tanh),
+    ):
+        fitted = system.fit(motion, seed=0)
+        seconds: tuple[list[float], list[float]] = ([], [])
+        found = []
+        for _ in range(options.repeats):
+            for k, own in enumerate((getattr(module, name), numpys(function))):
+                with patch.object(module, name, own):
+                    began = time.perf_counter()
+                    velocity = fitted.velocity(states)
+                    seconds[k].append(time.perf_counter() - began)
+                found.append(velocity)
+        torchs, theirs = (1e6 * statistics.median(s) for s in seconds)
+        apart = np.abs(found[0] - found[1]).max() / np.abs(found[1]).max()
+        print(
+            f"{fitted.title:22} {torchs:9.0f}  {theirs:9.0f}   {torchs / theirs:5.2f}   {apart:.1e}"
+        )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
