@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
+from iflow_gym.baselines.bases import normalised
 from iflow_gym.demonstrations import FloatArray
 
 OVERLAP = 0.7
@@ -16,11 +19,17 @@ def circular_bases(phase: FloatArray, n_basis: int) -> FloatArray:
     Ijspeert, Nakanishi, Hoffmann, Pastor & Schaal, "Dynamical movement primitives", Neural
     Computation 25(2), 2013, table 1: psi_i = exp(h (cos(2 pi s - c_i) - 1)).
     """
-    half = np.pi / n_basis
-    h = np.log(OVERLAP) / (np.cos(half) - 1)
+    cosine_and_sine = np.cos(2 * np.pi * phase[:, None] - (0.0, np.pi / 2))
+    # cos(2 pi s - c_i) is a product of matrices, and the -1 falls out of the quotient.
+    return normalised(cosine_and_sine @ _directions(n_basis))
+
+
+@lru_cache
+def _directions(n_basis: int) -> FloatArray:
+    """Return h (cos c_i, sin c_i), shape (2, n_basis)."""
+    h = np.log(OVERLAP) / (np.cos(np.pi / n_basis) - 1)
     centres = 2 * np.pi * np.arange(n_basis) / n_basis
-    activations = np.exp(h * (np.cos(2 * np.pi * phase[:, None] - centres) - 1))
-    return np.asarray(activations / activations.sum(axis=1, keepdims=True))
+    return np.asarray(h * np.stack([np.cos(centres), np.sin(centres)]))
 
 
 def ridge_regression(features: FloatArray, values: FloatArray, ridge: float) -> FloatArray:

@@ -31,10 +31,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 
+from iflow_gym.baselines.bases import normalised
 from iflow_gym.baselines.cycles import circular_bases, nearest_phase, ridge_regression
 from iflow_gym.baselines.starts import GivenStart
 from iflow_gym.demonstrations import Demonstrations, FloatArray
@@ -243,10 +245,14 @@ def discrete_bases(phase: FloatArray, n_basis: int) -> FloatArray:
     Centres lie evenly in time; each basis is as wide as its neighbour's centre is far.
     """
     z = phase_variable(phase)[:, None]
+    centres, widths = _centres_and_widths(n_basis)
+    exponents = (z - centres) ** 2
+    exponents *= -widths
+    return normalised(exponents) * z
+
+
+@lru_cache
+def _centres_and_widths(n_basis: int) -> tuple[FloatArray, FloatArray]:
     centres = phase_variable(np.linspace(0, 1, n_basis))
     gaps = np.diff(centres)
-    widths = -np.log(OVERLAP) / np.append(gaps, gaps[-1]) ** 2
-    exponents = -widths * (z - centres) ** 2
-    exponents -= exponents.max(axis=1, keepdims=True)
-    activations = np.exp(exponents)
-    return np.asarray(z * activations / activations.sum(axis=1, keepdims=True))
+    return centres, -np.log(OVERLAP) / np.append(gaps, gaps[-1]) ** 2

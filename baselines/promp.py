@@ -28,13 +28,16 @@ goal is added by such a curve, so that the motion ends there exactly.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from iflow_gym.baselines.bases import normalised
 from iflow_gym.baselines.cycles import circular_bases, nearest_phase, ridge_regression
 from iflow_gym.baselines.starts import EXACTNESS, GivenStart, minimum_jerk
 from iflow_gym.demonstrations import Demonstrations, FloatArray
@@ -248,12 +251,14 @@ def bases(phase: FloatArray, n_basis: int) -> FloatArray:
 
     Centres are spaced evenly from 0 to 1.
     """
-    centres = np.linspace(0, 1, n_basis)
-    width = -8 * n_basis**2 * np.log(OVERLAP)
-    exponents = -0.5 * width * (phase[:, None] - centres) ** 2
-    exponents -= exponents.max(axis=1, keepdims=True)
-    activations = np.exp(exponents)
-    return np.asarray(activations / activations.sum(axis=1, keepdims=True))
+    exponents = (phase[:, None] - _centres(n_basis)) ** 2
+    exponents *= 4 * n_basis**2 * math.log(OVERLAP)
+    return normalised(exponents)
+
+
+@lru_cache
+def _centres(n_basis: int) -> FloatArray:
+    return np.linspace(0, 1, n_basis)
 
 
 def _rounds(demonstrations: Demonstrations, n_basis: int) -> list[tuple[FloatArray, FloatArray]]:
