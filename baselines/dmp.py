@@ -38,7 +38,7 @@ import numpy as np
 
 from iflow_gym.baselines.bases import normalised
 from iflow_gym.baselines.cycles import circular_bases, nearest_phase, ridge_regression
-from iflow_gym.baselines.starts import GivenStart
+from iflow_gym.baselines.starts import GivenStart, by_basis, from_start
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.phases import common_phases
 from iflow_gym.primitive import MovementPrimitive, PhaseState
@@ -144,6 +144,8 @@ class DMP(MovementPrimitive):
         self.given_start_: GivenStart | None = given_start
         d = len(goal)
         self.weights_ = given_start.mean[:-d].reshape(-1, d)
+        weights = given_start.coefficients[:, :-d].reshape(-1, *self.weights_.shape)
+        self._weights = by_basis(weights)
         self._centre = goal
 
     def _adopt_cycle(self, weights: FloatArray, centre: FloatArray) -> None:
@@ -151,9 +153,10 @@ class DMP(MovementPrimitive):
         # The orbit: where the motion is a few rounds after it began anywhere.
         y, velocity = np.zeros((1, len(centre))), np.zeros((1, len(centre)))
         step, orbit = np.full(1, 1 / ORBIT), []
+        targets = self._circular((np.arange(ORBIT) + 0.5) / ORBIT)
         for k in range(ROUNDS * ORBIT):
             orbit.append((y[0], velocity[0]))
-            y, velocity = self._moved(y, velocity, self._circular(step * (k + 0.5)), step)
+            y, velocity = self._moved(y, velocity, targets[k % ORBIT], step)
         self._orbit, self._orbit_velocity = (np.stack(a[-ORBIT:]) for a in zip(*orbit, strict=True))
 
     def _circular(self, phase: FloatArray) -> FloatArray:
@@ -172,29 +175,29 @@ class DMP(MovementPrimitive):
             phase = nearest_phase(offset, self._orbit)
             velocity = self._orbit_velocity[np.rint(phase * ORBIT).astype(int) % ORBIT]
             return {**state, "phase": phase, "velocity": velocity}
-        values, _ = self.given_start_(offset)
-        weights = values[:, : -x.shape[1]].reshape(len(x), self.config.n_basis, x.shape[1])
-        return {
-            **state,
-            "start": offset,
-            "weights": weights,
-            "velocity": values[:, -x.shape[1] :],
-        }
+        factors, _ = self.given_start_(offset)
+        velocity = factors @ self.given_start_.coefficients[:, -x.shape[1] :]
+        return {**state, "start": offset, "factors": factors, "velocity": velocity}
 
     def _advance(
         self, x: FloatArray, state: PhaseState, phase: FloatArray, dt: FloatArray
     ) -> tuple[FloatArray, PhaseState]:
         elapsed = phase - state["phase"]
         middle = state["phase"] + 0.5 * elapsed
-        if self.given_start_ is None:
-            target = self._circular(middle)
-        else:
-            features = discrete_bases(middle, self.config.n_basis)
-            force = (features[:, None] @ state["weights"])[:, 0]
-            target = phase_variable(middle)[:, None] * state["start"] + force / self._stiffness
-            target[middle > 1] = 0.0
+        cycle = self.given_start_ is None
+        target = self._circular(middle) if cycle else self._target(state, middle)
         y, velocity = self._moved(x - self._centre, state["velocity"], target, elapsed)
         return y + self._centre, {"velocity": velocity}
+
+    def _target(self, state: PhaseState, phase: FloatArray) -> FloatArray:
+        """Return where the spring pulls to, shape (n, d): the goal once the forces have ended."""
+        if (phase > 1).all():
+            return np.zeros_like(state["start"])
+        curves = discrete_bases(phase, self.config.n_basis) @ self._weights
+        force = from_start(curves, state["factors"])
+        target = phase_variable(phase)[:, None] * state["start"] + force / self._stiffness
+        target[phase > 1] = 0.0
+        return target
 
     def _moved(
         self, y: FloatArray, velocity: FloatArray, target: FloatArray, elapsed: FloatArray

@@ -27,6 +27,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from iflow_gym.baselines.elementwise import exp_
+from iflow_gym.baselines.starts import by_basis, from_start, with_one
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.primitive import MovementPrimitive, PhaseState, tracked
 from iflow_gym.system import Guarantee
@@ -124,30 +126,33 @@ class KMP(MovementPrimitive):
         self.means_, self.covariances_ = means, covariances
         self.length_scale_, self.strength_ = length, strength
         self._scale, self._goal = scale, goal
-        self._alpha, self._lead = solved(means / scale, covariances / scale**2, length, strength)
+        alpha, lead = solved(means / scale, covariances / scale**2, length, strength)
+        # r(s) = k(s) alpha, and alpha is an affine function of the point to begin at.
+        self._alpha = by_basis(np.concatenate([scale * alpha[None], lead.transpose(2, 0, 1)]))
         self._grid = np.linspace(0, 1, len(means))
 
     # The motion ---------------------------------------------------------------------------
 
     def _begin(self, x: FloatArray, state: PhaseState) -> PhaseState:
-        # r(s) = k(s) alpha, and alpha is an affine function of the point to begin at.
-        alpha = self._scale * self._alpha + np.einsum("mij,nj->nmi", self._lead, x - self._goal)
-        return {**state, "alpha": alpha}
+        state = {**state, "factors": with_one(x - self._goal)}
+        return {**state, "reference": self._reference(state, state["phase"])}
 
     def _reference(self, state: PhaseState, phase: FloatArray) -> FloatArray:
         """Return r(s), shape (n, d), as an offset from the goal, which it is at from s = 1 on."""
-        k = kernel(np.clip(phase, 0.0, 1.0), self._grid, self.length_scale_)
-        path = (k[:, None] @ state["alpha"])[:, 0]
+        if (phase >= 1).all():
+            return np.zeros((len(phase), self.n_dims_))
+        curves = kernel(phase, self._grid, self.length_scale_) @ self._alpha
+        path = from_start(curves, state["factors"])
         path[phase >= 1] = 0.0
-        return np.asarray(path)
+        return path
 
     def _advance(
         self, x: FloatArray, state: PhaseState, phase: FloatArray, dt: FloatArray
     ) -> tuple[FloatArray, PhaseState]:
-        here = self._reference(state, state["phase"])
         there = self._reference(state, phase)
         elapsed = phase - state["phase"]
-        return self._goal + tracked(x - self._goal, here, there, self.config.feedback, elapsed), {}
+        offset = tracked(x - self._goal, state["reference"], there, self.config.feedback, elapsed)
+        return offset + self._goal, {"reference": there}
 
     @property
     def guarantee(self) -> Guarantee:
@@ -184,7 +189,9 @@ class KMP(MovementPrimitive):
 
 def kernel(s: FloatArray, t: FloatArray, length: float) -> FloatArray:
     """Return exp(-(s_i - t_j)^2 / 2 length^2), shape (n, m)."""
-    return np.asarray(np.exp(-0.5 * ((s[:, None] - t) / length) ** 2))
+    exponents = (s[:, None] - t) ** 2
+    exponents *= -0.5 / length**2
+    return exp_(exponents)
 
 
 def reference(paths: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike
 
 from iflow_gym.baselines.bases import normalised
 from iflow_gym.baselines.cycles import circular_bases, nearest_phase, ridge_regression
-from iflow_gym.baselines.starts import EXACTNESS, GivenStart, minimum_jerk
+from iflow_gym.baselines.starts import EXACTNESS, GivenStart, by_basis, from_start, minimum_jerk
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.phases import common_phases
 from iflow_gym.primitive import MovementPrimitive, PhaseState, tracked
@@ -138,9 +138,10 @@ class ProMP(MovementPrimitive):
             phase = np.arange(ORBIT) / ORBIT
             self._orbit = circular_bases(phase, self.config.n_basis) @ mean.T
             return
-        self._last = bases(np.ones(1), self.config.n_basis)[0]
-        flat = (mean + deviations).reshape(len(deviations), -1)
-        self._given_start = GivenStart.fit(starts - centre, flat)
+        weights = (mean + deviations).transpose(0, 2, 1)
+        self._given_start = GivenStart.fit(starts - centre, weights.reshape(len(weights), -1))
+        self._weights = by_basis(self._given_start.coefficients.reshape(-1, *weights.shape[1:]))
+        self._last = bases(np.ones(1), self.config.n_basis) @ self._weights
 
     @property
     def covariance_(self) -> FloatArray:
@@ -195,28 +196,34 @@ class ProMP(MovementPrimitive):
     def _begin(self, x: FloatArray, state: PhaseState) -> PhaseState:
         offset = x - self._centre
         if self._rhythmic:
-            return {**state, "phase": nearest_phase(offset, self._orbit)}
-        flat, rest = self._given_start(offset)
-        weights = flat.reshape(len(x), *self.mean_.shape)
-        return {**state, "weights": weights, "rest": rest, "lack": -(weights @ self._last)}
+            state = {**state, "phase": nearest_phase(offset, self._orbit)}
+        else:
+            factors, rest = self._given_start(offset)
+            state = {**state, "factors": factors, "rest": rest}
+        return {**state, "reference": self._reference(state, state["phase"])}
 
     def _reference(self, state: PhaseState, phase: FloatArray) -> FloatArray:
-        """Return r(s), shape (n, d), as an offset from the goal or the cycle's mean."""
+        """Return r(s), shape (n, d), as an offset from the goal or the cycle's mean.
+
+        It is at the goal from s = 1 on.
+        """
         if self._rhythmic:
             return self._bases(phase) @ self.mean_.T
-        s = np.clip(phase, 0.0, 1.0)
-        done = minimum_jerk(s)[:, None]
-        path = (state["weights"] @ self._bases(s)[:, :, None])[:, :, 0]
-        return np.asarray(path + (1 - done) * state["rest"] + done * state["lack"])
+        if (phase >= 1).all():
+            return np.zeros_like(state["rest"])
+        done = minimum_jerk(phase)[:, None]
+        curves = self._bases(phase) @ self._weights - done * self._last
+        path = from_start(curves, state["factors"]) + (1 - done) * state["rest"]
+        path[phase >= 1] = 0.0
+        return path
 
     def _advance(
         self, x: FloatArray, state: PhaseState, phase: FloatArray, dt: FloatArray
     ) -> tuple[FloatArray, PhaseState]:
-        here = self._reference(state, state["phase"])
         there = self._reference(state, phase)
         elapsed = phase - state["phase"]
-        offset = tracked(x - self._centre, here, there, self.config.feedback, elapsed)
-        return offset + self._centre, {}
+        offset = tracked(x - self._centre, state["reference"], there, self.config.feedback, elapsed)
+        return offset + self._centre, {"reference": there}
 
     @property
     def guarantee(self) -> Guarantee:

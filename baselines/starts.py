@@ -14,6 +14,10 @@ A handful of demonstrations that began close to each other says nothing of start
 formula would swing wildly there. So the offset x0 - mu_x is shortened to what was demonstrated: to
 the largest Mahalanobis distance of a demonstrated start. What it was shortened by is for the
 primitive to lead over, as the last part of a motion that fades.
+
+The mean is affine in the start, and what a primitive does at a phase is linear in its weights. So a
+batch of motions needs no weights of its own: bases times weights are a few curves that all share
+(`from_start`).
 """
 
 from __future__ import annotations
@@ -60,16 +64,22 @@ class GivenStart(NamedTuple):
         reach = np.linalg.norm(offsets @ whitening.T, axis=1).max(keepdims=True)
         return cls(mean, slope, start, whitening, reach)
 
-    def __call__(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the numbers, shape (n, k), for starts x, shape (n, d), and what is left of x.
+    @property
+    def coefficients(self) -> FloatArray:
+        """What the numbers are made of, shape (1 + d, k): mu_w, and what a unit of offset adds."""
+        return np.vstack([self.mean, self.slope.T])
 
-        The rest, shape (n, d), is what the offset from mu_x was shortened by.
+    def __call__(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what `coefficients` are multiplied by for starts x, shape (n, d), and a rest.
+
+        The factors, shape (n, 1 + d), are 1 and the offset from mu_x, shortened; the rest, shape
+        (n, d), is what it was shortened by. ``factors @ coefficients`` are the numbers.
         """
         offsets = x - self.start
         distances = np.linalg.norm(offsets @ self.whitening.T, axis=1)
         shorter = np.minimum(1.0, self.reach / np.maximum(distances, np.finfo(np.float64).tiny))
         reached = shorter[:, None] * offsets
-        return self.mean + reached @ self.slope.T, offsets - reached
+        return with_one(reached), offsets - reached
 
     def arrays(self) -> dict[str, FloatArray]:
         """Return what a file holds of it."""
@@ -87,10 +97,30 @@ class GivenStart(NamedTuple):
         return found
 
 
+def with_one(offsets: FloatArray) -> FloatArray:
+    """Return offsets, shape (n, d), with a 1 before each, shape (n, 1 + d)."""
+    return np.insert(offsets, 0, 1.0, axis=1)
+
+
+def by_basis(weights: FloatArray) -> FloatArray:
+    """Return weights of B bases, shape (1 + d, B, d), as `from_start`'s, shape (B, (1 + d) d)."""
+    return np.asarray(weights.transpose(1, 0, 2).reshape(weights.shape[1], -1))
+
+
+def from_start(curves: FloatArray, factors: FloatArray) -> FloatArray:
+    """Return sum_k factors_k curves_k, shape (n, d), of factors, shape (n, 1 + d).
+
+    The curves, bases times weights, shape (n, (1 + d) d), are the motion from the mean start and
+    what a unit of offset along each axis adds to it, at a phase for each row.
+    """
+    n, m = factors.shape
+    return np.asarray(np.einsum("nkd,nk->nd", curves.reshape(n, m, -1), factors))
+
+
 def minimum_jerk(phase: FloatArray) -> FloatArray:
     """Return the share, shape (n,), of a way from rest to rest that is done at phases in [0, 1].
 
     Flash & Hogan, "The coordination of arm movements", J. Neuroscience 5(7), 1985.
     """
     s = np.clip(phase, 0.0, 1.0)
-    return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
+    return np.asarray(s * s * s * (10.0 - s * (15.0 - 6.0 * s)))

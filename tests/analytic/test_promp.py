@@ -75,6 +75,21 @@ def test_each_demonstration_is_a_weighted_sum_of_the_bases():
     assert error < 1e-3 * shown.bounding_box.diagonal
 
 
+@pytest.mark.parametrize("name", ["promp", "kmp", "dmp"])
+def test_motions_at_different_phases_go_on_as_each_alone(name):
+    shown = load_lasa("Sshape")
+    primitive = load_method(name)().fit(shown, seed=0)
+    starts = shown.starts[:3] + np.array([[0.0, 0.0], [30.0, -5.0], [1.0, 2.0]])
+    first = np.array([0.2, 0.6, 1.5]) * primitive.duration(starts)  # the last is over by then
+
+    def after(x, dt):
+        x, state = primitive.advance(x, primitive.begin(x), dt)
+        return primitive.advance(x + 1.0, state, 0.05)[0]
+
+    alone = [after(starts[k : k + 1], first[k : k + 1])[0] for k in range(3)]
+    np.testing.assert_allclose(after(starts, first), alone, atol=1e-10)
+
+
 # The start ----------------------------------------------------------------------------------
 
 
@@ -86,8 +101,8 @@ def test_numbers_given_the_start_are_a_conditional_gaussian_mean():
     noise = EXACTNESS * np.trace(joint[:2, :2]) / 2 * np.eye(2)
     gain = joint[2:, :2] @ np.linalg.inv(joint[:2, :2] + noise)
     expected = values.mean(axis=0) + (starts - starts.mean(axis=0)) @ gain.T
-    found, rest = given(starts)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    factors, rest = given(starts)
+    np.testing.assert_allclose(factors @ given.coefficients, expected, atol=1e-12)
     np.testing.assert_allclose(rest, 0.0, atol=1e-12)
 
 
@@ -102,8 +117,8 @@ def test_beyond_the_demonstrated_starts_the_rest_is_given_back():
 
 def test_starts_in_one_place_say_nothing():
     given = GivenStart.fit(np.ones((4, 2)), np.arange(12.0).reshape(4, 3))
-    found, rest = given(np.array([[5.0, 1.0]]))
-    np.testing.assert_array_equal(found, [[4.5, 5.5, 6.5]])
+    factors, rest = given(np.array([[5.0, 1.0]]))
+    np.testing.assert_array_equal(factors @ given.coefficients, [[4.5, 5.5, 6.5]])
     np.testing.assert_array_equal(rest, [[4.0, 0.0]])
 
 
