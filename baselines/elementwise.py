@@ -1,7 +1,8 @@
-"""exp and tanh of arrays in place, by torch.
+"""exp, exp2 and tanh of arrays in place, by torch.
 
 In float64 NumPy's take about three times as long where a processor has no AVX-512, and a field of
-kernels or units is little else.
+kernels or units is little else. Where torch takes exp from MKL, exp2 takes about half its time: a
+product of matrices gives exponents of either base.
 """
 
 from __future__ import annotations
@@ -14,6 +15,12 @@ from iflow_gym.demonstrations import FloatArray
 def exp_(values: FloatArray) -> FloatArray:
     """Replace values by their exponentials, and return them."""
     torch.from_numpy(values).exp_()
+    return values
+
+
+def exp2_(values: FloatArray) -> FloatArray:
+    """Replace values by 2 to their power, and return them."""
+    torch.from_numpy(values).exp2_()
     return values
 
 

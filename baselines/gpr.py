@@ -34,7 +34,8 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from iflow_gym.baselines.elementwise import exp_
+from iflow_gym.baselines.elementwise import exp2_, exp_
+from iflow_gym.baselines.kernels import SquaredExponentials
 from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
@@ -141,6 +142,7 @@ class GPR(DynamicalSystem):
         self._centre = centre
         self._scaled = inducing / length_scales
         self._squares = 0.5 * (self._scaled**2).sum(axis=1)
+        self._fast = SquaredExponentials(inducing, length_scales, self.signal_variance_)
         gram = self._kernel(inducing)
         gram[np.diag_indices(len(gram))] += JITTER * self.signal_variance_
         self._root = cholesky(gram, lower=True)
@@ -158,7 +160,8 @@ class GPR(DynamicalSystem):
         return exponent
 
     def _velocity(self, x: FloatArray) -> FloatArray:
-        return self._kernel(x - self._centre) @ self.alpha_
+        # `_kernel` in fewer passes, with other rounding, to which the fit's alpha is sensitive.
+        return exp2_(self._fast.exponents(x - self._centre)) @ self.alpha_
 
     def variance(self, x: ArrayLike) -> FloatArray:
         """Return the predictive variance of each component, shape (...), noise included.

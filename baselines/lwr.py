@@ -22,7 +22,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from iflow_gym.baselines.elementwise import exp_
+from iflow_gym.baselines.elementwise import exp2_
+from iflow_gym.baselines.kernels import SquaredExponentials
 from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
@@ -35,6 +36,9 @@ BLOCKS = 10
 
 SELECTION_SAMPLES = 1000
 """Samples, evenly taken, on which bandwidths are compared."""
+
+SMALL = -900.0
+"""Where all weights are below 2 to this power, they are taken relative to the nearest sample's."""
 
 
 @dataclass(frozen=True)
@@ -162,29 +166,30 @@ class LocalFits:
     """
 
     def __init__(self, x: FloatArray, v: FloatArray, ridge: float) -> None:
-        self._x, self._ridge, self._n_outputs = x, ridge, v.shape[1]
-        self._halves = 0.5 * (x**2).sum(axis=1)
-        d = x.shape[1]
-        products = (x[:, :, None] * x[:, None]).reshape(len(x), d * d)
-        crossed = (x[:, :, None] * v[:, None]).reshape(len(x), -1)
-        self._moments = np.hstack([np.ones((len(x), 1)), x, v, products, crossed])
+        n, d = x.shape
+        self._n_outputs, self._ridge = v.shape[1], ridge * np.eye(d)[:, :, None]
+        self._kernels = SquaredExponentials(x, 1.0)
+        rows, columns = np.triu_indices(d)
+        crossed = (x[:, :, None] * v[:, None]).reshape(n, -1)
+        self._moments = np.hstack([np.ones((n, 1)), x, v, crossed, x[:, rows] * x[:, columns]])
+        self._squares = np.empty((d, d), dtype=int)  # where x xᵀ is among the moments
+        self._squares[rows, columns] = self._squares[columns, rows] = np.arange(-len(rows), 0)
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the fits' values, shape (n, k), at positions x, shape (n, d), in bandwidths."""
-        d, k = x.shape[1], self._n_outputs
-        weights = x @ self._x.T
-        weights -= self._halves
-        weights -= weights.max(axis=1, keepdims=True)  # the nearest sample has the weight 1
-        sums = exp_(weights) @ self._moments
-        sums /= sums[:, :1]
-        mean_x, mean_v = sums[:, 1 : 1 + d], sums[:, 1 + d : 1 + d + k]
-        products = sums[:, 1 + d + k : 1 + d + k + d * d].reshape(-1, d, d)
-        crossed = sums[:, 1 + d + k + d * d :].reshape(-1, d, k)
+        (n, d), k = x.shape, self._n_outputs
+        weights = self._kernels.exponents(x)
+        if not weights.max(axis=1).min(initial=0.0) > SMALL:
+            weights = self._kernels.relative_exponents(x)
+        sums = (exp2_(weights) @ self._moments).T
+        sums = sums / sums[0]
+        mean_x, mean_v = sums[1 : 1 + d], sums[1 + d : 1 + d + k]
+        crossed = sums[1 + d + k : 1 + d + k + d * k].reshape(d, k, n)
         # b = mean_v - A (mean_x - x): the intercept of a fit whose slopes alone are penalised.
-        covariance = products - mean_x[:, :, None] * mean_x[:, None]
-        covariance[:, np.arange(d), np.arange(d)] += self._ridge
-        slopes = np.linalg.solve(covariance, crossed - mean_x[:, :, None] * mean_v[:, None])
-        return np.asarray(mean_v + ((x - mean_x)[:, None] @ slopes)[:, 0])
+        covariance = sums[self._squares] - mean_x[:, None] * mean_x + self._ridge
+        across = crossed - mean_x[:, None] * mean_v
+        away = np.linalg.solve(covariance.T, (x - mean_x.T)[:, :, None])[:, :, 0].T
+        return np.asarray((mean_v + (away[:, None] * across).sum(axis=0)).T)
 
 
 def choose_bandwidth(

@@ -1,8 +1,8 @@
-"""A batch of LWR, GPR and BC with torch's exp and tanh, and with NumPy's: medians in one run.
+"""A batch of LWR, GPR and BC with torch's exp2 and tanh, and with NumPy's: medians in one run.
 
     OMP_NUM_THREADS=1 python benchmarks/elementwise.py [--n-states 263]
 
-Which is faster depends on the processor: NumPy's exp and tanh of doubles use AVX-512, and without
+Which is faster depends on the processor: NumPy's exp2 and tanh of doubles use AVX-512, and without
 it no vector instructions. Velocities by both are compared, too.
 """
 
@@ -44,8 +44,8 @@ def main(options: Options) -> None:
     states = rng.uniform(low, high, size=(options.n_states, motion.n_dims))
     print(f"{options.n_states} states{'':13}torch us   NumPy us   ratio   difference")
     for module, system, name, function in (
-        (lwr, lwr.LWR(), "exp_", np.exp),
-        (gpr, gpr.GPR(), "exp_", np.exp),
+        (lwr, lwr.LWR(), "exp2_", np.exp2),
+        (gpr, gpr.GPR(), "exp2_", np.exp2),
         (bc, bc.BehaviouralCloning(n_steps=100), "tanh_", np.tanh),
     ):
         fitted = system.fit(motion, seed=0)

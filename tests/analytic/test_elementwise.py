@@ -1,4 +1,4 @@
-"""exp and tanh in place, against NumPy's."""
+"""exp, exp2 and tanh in place, against NumPy's."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from iflow_gym.baselines.elementwise import exp_, tanh_
+from iflow_gym.baselines.elementwise import exp2_, exp_, tanh_
 
 VALUES = arrays(np.float64, array_shapes(min_dims=1, max_dims=2, min_side=0), elements=st.floats())
 
 
-@pytest.mark.parametrize(("ours", "numpys"), [(exp_, np.exp), (tanh_, np.tanh)])
+@pytest.mark.parametrize(("ours", "numpys"), [(exp_, np.exp), (exp2_, np.exp2), (tanh_, np.tanh)])
 @given(values=VALUES)
 def test_they_are_numpys_to_rounding_and_in_place(ours, numpys, values):
     with np.errstate(over="ignore", invalid="ignore"):

@@ -43,6 +43,23 @@ def test_far_away_it_goes_on_as_the_nearest_sample_does():
     np.testing.assert_allclose(system.velocity(far), system.velocities_[nearest], rtol=0.05)
 
 
+def test_weights_that_all_underflow_are_relative_to_the_nearest_samples():
+    rng = np.random.default_rng(0)
+    samples, values = rng.normal(size=(40, 2)), rng.normal(size=(40, 2))
+    fits = LocalFits(samples, values, 1e-3)
+    for distance in (30.0, 60.0, 1e3):  # weights of about 1e-196, 0 and 0
+        asked = distance * np.array([[0.6, 0.8], [-0.8, 0.6]])
+        squares = 0.5 * ((samples - asked[:, None]) ** 2).sum(axis=2)
+        weights = np.exp(squares.min(axis=1, keepdims=True) - squares)
+        weights /= weights.sum(axis=1, keepdims=True)
+        for x, w, found in zip(asked, weights, fits(asked), strict=True):
+            mean_x, mean_v = w @ samples, w @ values
+            around = samples - mean_x
+            covariance = (w * around.T) @ around + 1e-3 * np.eye(2)
+            slopes = np.linalg.solve(covariance, (w * around.T) @ (values - mean_v))
+            np.testing.assert_allclose(found, mean_v + (x - mean_x) @ slopes, rtol=1e-6)
+
+
 def test_the_bandwidth_has_the_least_error_on_what_is_left_out():
     """A wave that all demonstrations show asks for a small one, noise for a large one."""
     rng = np.random.default_rng(0)
