@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
+from iflow_gym.baselines.elementwise import exp_
 from iflow_gym.baselines.subsets import evenly
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee, check_positive_definite
@@ -104,23 +105,25 @@ class MixtureField:
         spreads: FloatArray,
         conditionals: tuple[FloatArray, FloatArray, FloatArray],
     ) -> None:
-        d = centres.shape[1]
+        k, d = centres.shape
         self.n_dims = d
         self.gains, self.offsets, self.conditional_covariances = conditionals
-        # log pi_k N(x; mu_k, Sigma_k) = constant_k - ‖W_k x - w_k‖² / 2, all k in one product.
+        # log pi_k N(x; mu_k, Sigma_k) = constant_k - ‖W_k x - w_k‖², all k in one product. Arrays
+        # have the axis of positions last, so that sums over the short ones are sums of rows.
         whitening = np.linalg.inv(np.linalg.cholesky(spreads))
-        self._whitening = whitening.reshape(-1, d).T.copy()
-        self._white_means = np.einsum("kij,kj->ki", whitening, centres).ravel()
         self._constants = (
             np.log(priors)
             + np.log(np.diagonal(whitening, axis1=1, axis2=2)).sum(axis=1)
             - 0.5 * d * np.log(2 * np.pi)
-        )
+        )[:, None]
+        rows = np.swapaxes(whitening, 0, 1) / np.sqrt(2)
+        self._whitening = rows.reshape(d * k, d)
+        self._white_means = np.einsum("ikj,kj->ik", rows, centres).reshape(d * k, 1)
         spread = np.sqrt(np.trace(spreads, axis1=1, axis2=2))
         self._far = FAR * float((np.linalg.norm(centres, axis=1) + spread).max())
         self._stacked_gains = self.gains.reshape(-1, d).T.copy()
-        self._stacked_offsets = self.offsets.ravel()
-        self._flat_gains = self.gains.reshape(len(priors), d * d)
+        self._flat_gains = self.gains.reshape(k, d * d).T.copy()
+        self._flat_offsets = self.offsets.T.copy()
 
     @classmethod
     def of_joint(cls, priors: FloatArray, means: FloatArray, covariances: FloatArray) -> Self:
@@ -130,11 +133,14 @@ class MixtureField:
 
     def log_densities(self, x: FloatArray) -> FloatArray:
         """Return log pi_k N(x; mu_k, Sigma_k), shape (n, K), of positions x, shape (n, d)."""
-        white = x @ self._whitening
+        return self._log_densities(x).T
+
+    def _log_densities(self, x: FloatArray) -> FloatArray:
+        white = self._whitening @ x.T
         white -= self._white_means
         white *= white
-        squares = white.reshape(len(x), len(self._constants), self.n_dims).sum(axis=2)
-        return np.asarray(self._constants - 0.5 * squares)
+        squares = white.reshape(self.n_dims, len(self._constants), len(x)).sum(axis=0)
+        return np.asarray(self._constants - squares)
 
     def weights(self, x: FloatArray) -> FloatArray:
         """Return h_k(x), shape (n, K), rows that sum to 1 wherever x is.
@@ -143,28 +149,32 @@ class MixtureField:
         underflows the nearest Gaussian, in its own metric, has the weight. Beyond `FAR` positions
         are pulled back along their ray from the goal, whose limit the weights have reached.
         """
+        return self._weights(x).T
+
+    def _weights(self, x: FloatArray) -> FloatArray:
         reach = float(np.abs(x).max(initial=0.0))
         if reach > self._far:
             x = x * np.minimum(1.0, self._far / np.abs(x).max(axis=1, keepdims=True))
-        h = self.log_densities(x)
-        h -= h.max(axis=1, keepdims=True)
-        np.exp(h, out=h)
-        h /= h.sum(axis=1, keepdims=True)
+        h = self._log_densities(x)
+        h -= h.max(axis=0)
+        exp_(h)
+        h /= h.sum(axis=0)
         return h
 
     def means(self, x: FloatArray) -> FloatArray:
         """Return E[v | x, k] = A_k x + b_k, shape (n, K, d)."""
-        flat = x @ self._stacked_gains
-        flat += self._stacked_offsets
-        return flat.reshape(len(x), len(self._constants), self.n_dims)
+        return (x @ self._stacked_gains).reshape(len(x), *self.offsets.shape) + self.offsets
 
     def velocity(self, x: FloatArray) -> FloatArray:
         """Return E[v | x], shape (n, d)."""
-        return np.asarray((self.weights(x)[:, None, :] @ self.means(x))[:, 0])
+        h, d = self._weights(x), self.n_dims
+        gain = (self._flat_gains @ h).reshape(d, d, len(x))
+        return np.asarray(((gain * x.T).sum(axis=1) + self._flat_offsets @ h).T)
 
     def gain(self, x: FloatArray) -> FloatArray:
         """Return sum_k h_k(x) A_k, shape (n, d, d)."""
-        return (self.weights(x) @ self._flat_gains).reshape(len(x), self.n_dims, self.n_dims)
+        gain = self._flat_gains @ self._weights(x)
+        return gain.T.reshape(len(x), self.n_dims, self.n_dims)
 
     def covariance(self, x: FloatArray) -> FloatArray:
         """Return Cov(v | x), shape (n, d, d): within the Gaussians and between them."""

@@ -106,8 +106,8 @@ class SEDS(DynamicalSystem):
         # ‖x'‖² - ‖x‖² = dt mᵀ (A + Aᵀ) m < 0 with m = (x + x') / 2.
         offset = x - self._goal
         half = 0.5 * dt[:, None, None] * self.field_.gain(offset)
-        pull = 2.0 * (half @ offset[:, :, None])
-        return np.asarray(x + np.linalg.solve(self._eye - half, pull)[:, :, 0])
+        pull = 2.0 * (half.T * offset.T[:, None]).sum(axis=0).T
+        return np.asarray(x + np.linalg.solve(self._eye - half, pull[:, :, None])[:, :, 0])
 
     def _lyapunov(self, x: FloatArray) -> FloatArray:
         return np.asarray(0.5 * ((x - self._goal) ** 2).sum(axis=1))
