@@ -11,7 +11,8 @@ The ridge term (ibid., section 9.1) matters where the samples around x lie on a 
 bandwidth h is the one of least error on demonstrations left out one at a time (ibid., section 8.2,
 with demonstrations in place of samples: neighbours in time are no test of each other).
 
-Deviation: samples are thinned to an even subset, so that a batch of positions takes a millisecond.
+Deviation: samples are thinned to an even subset, so that a batch of positions takes less than a
+millisecond.
 """
 
 from __future__ import annotations
