@@ -42,7 +42,9 @@ class Controller:
 
     def corrected(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return f, shape (n, d), V and rho, shape (n,), and the gradient of V, shape (n, d)."""
-        raw = self.regressor.velocity(x * self.length) * (self.time / self.length)
+        # Columns in memory order, as those of the gradient: operations on all rows run along them.
+        raw = np.asfortranarray(self.regressor.velocity(x * self.length))
+        raw = raw * (self.time / self.length)
         value, gradient = self.energy.value_and_gradient(x)
         square = np.einsum("ni,ni->n", gradient, gradient)
         distance = np.einsum("ni,ni->n", x, x)
@@ -52,7 +54,7 @@ class Controller:
             rho = -self.rho0 * np.expm1(-self.kappa0 * distance) * np.sqrt(square)
         excess = np.maximum(np.einsum("ni,ni->n", gradient, raw) + rho, 0.0)
         moving = square > 0
-        pull = np.where(moving, excess / np.where(moving, square, 1.0), 0.0)
+        pull = excess / np.where(moving, square, 1.0)
         velocity = np.where(moving[:, None], raw - pull[:, None] * gradient, 0.0)
         return velocity, value, rho, gradient
 
@@ -63,10 +65,6 @@ class Controller:
         above it.
         """
         velocity, value, rho, _ = self.corrected(x)
-        after = x + dt[:, None] * velocity
         safe = np.where(value > 0, value, 1.0)
         level = value * np.exp(-rho * dt / safe)
-        above = np.flatnonzero(self.energy.value(after) > level)
-        if len(above):
-            after[above] = self.energy.pulled_back(after[above], level[above])
-        return after
+        return self.energy.lowered(x + dt[:, None] * velocity, level)

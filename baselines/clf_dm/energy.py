@@ -39,6 +39,12 @@ LEAST_LEFT = 1e-3
 NEWTON_STEPS = 60
 """At most; two or three are usual."""
 
+NEWTON_TOLERANCE = 1e-8
+"""Of s, and how large the last step may be: it leaves an error of about its own square."""
+
+TINY = float(np.finfo(np.float64).tiny)
+"""Keeps a slope or a norm that is 0 from being divided by."""
+
 
 class Energy:
     """V, ready for many calls.
@@ -53,64 +59,77 @@ class Energy:
 
     def __init__(self, matrices: FloatArray, centres: FloatArray) -> None:
         self.matrices, self.centres = matrices, centres
-        n, d = matrices.shape[:2]
-        self._shape = (-1, n, d)
-        self._stacked = matrices.reshape(-1, d).T.copy()
+        self._stacked = matrices.reshape(-1, matrices.shape[-1])
         self._shifts = shifted(matrices, centres)
+        self._half_shifts = 0.5 * self._shifts.T
 
-    def _brackets(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return P_l x, shape (n, L + 1, d), and the brackets where they count, (n, L + 1)."""
-        products = (x @ self._stacked).reshape(self._shape)
-        brackets = ((products - self._shifts) @ x[:, :, None])[:, :, 0]
-        np.maximum(brackets, 0.0, out=brackets)
-        return products, brackets
+    def _rays(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return P_l x, shape (L + 1, d, n), xᵀ P_l x and xᵀ P_l mu_l, shape (L + 1, n).
+
+        At s x the bracket of term l is s (s xᵀ P_l x - xᵀ P_l mu_l). Terms lead here: sums over the
+        few of them then run along memory.
+        """
+        columns = np.ascontiguousarray(x.T)
+        products = (self._stacked @ columns).reshape(*self.matrices.shape[:2], -1)
+        return products, np.einsum("ldn,dn->ln", products, columns), self._shifts @ columns
 
     def value(self, x: FloatArray) -> FloatArray:
         """Return V, shape (n,), of offsets x, shape (n, d)."""
-        _, brackets = self._brackets(x)
-        return _sum(brackets)
+        _, squares, slopes = self._rays(x)
+        return _sum(np.maximum(squares - slopes, 0.0))
 
     def value_and_gradient(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return V, shape (n,), and its gradient, shape (n, d)."""
-        products, brackets = self._brackets(x)
+        products, squares, slopes = self._rays(x)
+        brackets = np.maximum(squares - slopes, 0.0)
         value = _sum(brackets)
-        weights = 2.0 * brackets
-        weights[:, 0] = 1.0
-        products *= 2.0
-        products -= self._shifts
-        return value, (weights[:, None] @ products)[:, 0]
+        weights = 4.0 * brackets
+        weights[0] = 2.0
+        gradient = np.einsum("ln,ldn->dn", weights, products)
+        gradient -= self._half_shifts @ weights
+        return value, gradient.T
 
-    def pulled_back(self, x: FloatArray, level: FloatArray) -> FloatArray:
-        """Return the points s x, 0 < s <= 1, with V(s x) = level, for V(x) >= level > 0.
+    def lowered(self, x: FloatArray, level: FloatArray) -> FloatArray:
+        """Return x where V(x) <= level, shape (n,), and else s x, 0 <= s < 1, V(s x) = level.
 
-        V(s x) is convex and increasing in s, so that Newton's method from s = 1 falls to the root.
+        The root of V(s x) is the length of a vector whose components are convex and increasing in
+        s, and so is convex and increasing itself: from above, Newton's method falls to the s where
+        it is that of the level. It starts where the part of V(s x) that is s² times a number, and
+        which V exceeds, reaches the level: near the goal that is nearly all of V.
         """
-        # Terms lead here: sums over the few of them then run along memory.
-        n_terms, d = self.matrices.shape[:2]
-        columns = np.ascontiguousarray(x.T)
-        products = (self.matrices.reshape(-1, d) @ columns).reshape(n_terms, d, -1)
-        squares, slopes = (products * columns).sum(axis=1), self._shifts @ columns
-        s = np.ones(len(x))
+        _, squares, slopes = self._rays(x)
+        value = _sum(np.maximum(squares - slopes, 0.0))
+        above = np.flatnonzero(value > level)
+        if not len(above):
+            return x
+        if len(above) < len(x):
+            squares, slopes, level = squares[:, above], slopes[:, above], level[above]
+        outward = np.minimum(slopes, 0.0)
+        least = squares[0] + np.einsum("ln,ln->n", outward, outward)
+        roots = np.sqrt(level)
+        s = np.minimum(roots / np.sqrt(least), 1.0)  # 0 where the level has underflown to it
         for _ in range(NEWTON_STEPS):
             reached = s * squares
             rates = reached - slopes
-            brackets = s * rates
+            brackets = np.maximum(s * rates, 0.0)
             rates += reached
-            np.maximum(brackets, 0.0, out=brackets)
-            terms = brackets[1:]
-            slope = rates[0] + 2.0 * (terms * rates[1:]).sum(axis=0)
-            terms *= terms
-            change = np.maximum(brackets.sum(axis=0) - level, 0.0) / slope
-            s -= change
-            if (change <= 1e-12 * s).all():
+            rates[0] *= 0.5
+            value = _sum(brackets)
+            brackets[0] = 1.0
+            slope = np.einsum("ln,ln->n", brackets, rates) + TINY
+            change = (value - roots * np.sqrt(value)) / slope
+            s -= np.maximum(change, 0.0)
+            if (change <= NEWTON_TOLERANCE * s).all():
                 break
-        return np.asarray(s[:, None] * x)
+        fractions = np.ones(len(x))
+        fractions[above] = s
+        return np.asarray(fractions[:, None] * x)
 
 
 def _sum(brackets: FloatArray) -> FloatArray:
-    """Return V, shape (n,), from the brackets where they count, shape (n, L + 1)."""
-    terms = brackets[:, 1:]
-    return np.asarray(brackets[:, 0] + np.einsum("nl,nl->n", terms, terms))
+    """Return V, shape (n,), from the brackets where they count, shape (L + 1, n)."""
+    terms = brackets[1:]
+    return np.asarray(brackets[0] + np.einsum("ln,ln->n", terms, terms))
 
 
 def shifted(matrices: FloatArray, centres: FloatArray) -> FloatArray:
@@ -192,7 +211,7 @@ def objective(
     weights = 2.0 * np.maximum(brackets, 0.0)
     weights[0] = 1.0
     gradient = (weights[:, None] * inner).sum(axis=0)
-    norms = np.maximum(np.sqrt((gradient**2).sum(axis=0)), np.finfo(np.float64).tiny)
+    norms = np.maximum(np.sqrt((gradient**2).sum(axis=0)), TINY)
     unit = gradient / norms
     psi = (unit * directions).sum(axis=0)
     signed = np.where(psi > 0, 1.0, -weight)

@@ -118,7 +118,7 @@ class CLFDM(DynamicalSystem):
         self.length_, self.time_ = controller.length, controller.time
 
     def _offsets(self, x: FloatArray) -> FloatArray:
-        return (x - self._goal) / self.length_
+        return (np.asfortranarray(x) - self._goal) / self.length_
 
     def _velocity(self, x: FloatArray) -> FloatArray:
         velocity, _, _, _ = self.controller_.corrected(self._offsets(x))

@@ -73,13 +73,15 @@ def test_a_point_is_pulled_back_onto_the_level_along_its_ray(d):
     rng = np.random.default_rng(2)
     x = 3 * rng.normal(size=(200, d))
     level = energy.value(x) * np.exp(-rng.uniform(0, 20, size=200))
-    back = energy.pulled_back(x, level)
+    back = energy.lowered(x, level)
     np.testing.assert_allclose(energy.value(back), level, rtol=1e-9)
     np.testing.assert_allclose(
         back / np.linalg.norm(back, axis=1, keepdims=True),
         x / np.linalg.norm(x, axis=1, keepdims=True),
         atol=1e-12,
     )
+    np.testing.assert_array_equal(energy.lowered(x, energy.value(x)), x)
+    np.testing.assert_array_equal(energy.lowered(x, np.zeros(200)), 0 * x)
 
 
 @pytest.mark.parametrize("d", [2, 3])
