@@ -24,7 +24,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from iflow_gym.baselines.elementwise import tanh_
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.system import DynamicalSystem, Guarantee
 
@@ -139,11 +138,19 @@ class BehaviouralCloning(DynamicalSystem):
     ) -> None:
         self.layers_ = tuple(layers)
         self.centre_, self.length_, self.speed_ = centre, float(length), float(speed)
+        # tanh z = 2 sigmoid(2 z) - 1: the network of sigmoids that takes x and gives velocities.
+        w1, b1, w2, b2, w3, b3 = self.layers_
+        w1 = w1 / self.length_
+        self._sigmoid_layers = (
+            *(2 * w1, 2 * (b1 - centre @ w1)),
+            *(4 * w2, 2 * (b2 - w2.sum(axis=0))),
+            *(2 * self.speed_ * w3, self.speed_ * (b3 - w3.sum(axis=0))),
+        )
 
     def _velocity(self, x: FloatArray) -> FloatArray:
-        w1, b1, w2, b2, w3, b3 = self.layers_
-        hidden = tanh_((x - self.centre_) / self.length_ @ w1 + b1)
-        return self.speed_ * (tanh_(hidden @ w2 + b2) @ w3 + b3)
+        w1, b1, w2, b2, w3, b3 = self._sigmoid_layers
+        hidden = _sigmoid(x @ w1, b1)
+        return np.asarray(_sigmoid(hidden @ w2, b2) @ w3 + b3)
 
     @property
     def guarantee(self) -> Guarantee:
@@ -174,6 +181,13 @@ class BehaviouralCloning(DynamicalSystem):
         if not all(np.isfinite(a.astype(np.float32)).all() for a in layers):
             raise ValueError("expected weights that single precision holds, got larger ones")
         self._adopt(layers, centre, *scales)
+
+
+def _sigmoid(values: FloatArray, biases: FloatArray) -> FloatArray:
+    """Replace values by sigmoid(values + biases), and return them."""
+    values += biases
+    torch.from_numpy(values).sigmoid_()
+    return values
 
 
 # Training -----------------------------------------------------------------------------------
