@@ -304,11 +304,14 @@ def _train(
     """Train a network for each job and yield the averaged ones after each number of steps."""
     d = jobs[0].samples.shape[1] // 2
     generators = [np.random.default_rng(job.seed) for job in jobs]
-    weights = [_initial(d, config.width, g) for g in generators]
-    tensors = [torch.from_numpy(np.stack(w)).requires_grad_() for w in zip(*weights, strict=True)]
-    average = [torch.zeros_like(t) for t in tensors]
-    first, second = ([torch.zeros_like(t) for t in tensors] for _ in range(2))
-    shrink = 1 - config.learning_rate * torch.tensor([job.decay for job in jobs])[:, None, None]
+    weights = zip(*(_initial(d, config.width, g) for g in generators), strict=True)
+    layers = [torch.from_numpy(np.stack(w)) for w in weights]
+    numbers = _flat(layers)
+    tensors = [t.detach().requires_grad_() for t in _views(numbers, layers)]
+    average, first, second = (torch.zeros_like(numbers) for _ in range(3))
+    decay = config.learning_rate * torch.tensor([job.decay for job in jobs])[:, None, None]
+    # Biases, the odd ones, do not decay.
+    shrink = _flat([torch.ones_like(t) - (k % 2 == 0) * decay for k, t in enumerate(layers)])
     longest = max(len(job.samples) for job in jobs)
     data = torch.zeros(len(jobs), longest, 2 * d)
     for i, job in enumerate(jobs):
@@ -325,14 +328,22 @@ def _train(
             for picked in torch.from_numpy(np.stack(drawn, axis=1)):
                 x, v = data[rows, picked].chunk(2, dim=2)
                 loss = ((_forward(tensors, x) - v) ** 2).sum() / config.batch_size
-                gradients = torch.autograd.grad(loss, tensors)
+                gradient = _flat(torch.autograd.grad(loss, tensors))
                 done += 1
-                with torch.no_grad():
-                    _adam(tensors, gradients, first, second, done, config.learning_rate, shrink)
-                    for kept, tensor in zip(average, tensors, strict=True):
-                        kept.lerp_(tensor, 1 - config.averaging)
-        unbiased = 1 - config.averaging**done
-        yield _Network([kept / unbiased for kept in average])
+                _adam(numbers, gradient, first, second, done, config.learning_rate, shrink)
+                average.lerp_(numbers, 1 - config.averaging)
+        yield _Network(_views(average / (1 - config.averaging**done), layers))
+
+
+def _flat(tensors: Sequence[Tensor]) -> Tensor:
+    """Return each network's numbers in one row, shape (networks, size)."""
+    return torch.cat([t.flatten(1) for t in tensors], dim=1)
+
+
+def _views(numbers: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
+    """Return the parts of rows as tensors of the shapes of others, which `_flat` put in rows."""
+    parts = torch.split_with_sizes(numbers, [t[0].numel() for t in like], dim=1)
+    return [part.view(t.shape) for part, t in zip(parts, like, strict=True)]
 
 
 def _initial(d: int, width: int, rng: np.random.Generator) -> list[Samples]:
@@ -349,21 +360,17 @@ def _initial(d: int, width: int, rng: np.random.Generator) -> list[Samples]:
 
 
 def _adam(
-    tensors: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    first: Sequence[Tensor],
-    second: Sequence[Tensor],
+    numbers: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
     step: int,
     rate: float,
     shrink: Tensor,
 ) -> None:
-    """Take a step of Adam with decoupled decay; biases, the odd tensors, do not decay."""
-    for k, (tensor, gradient, m, v) in enumerate(
-        zip(tensors, gradients, first, second, strict=True)
-    ):
-        m.lerp_(gradient, 1 - BETAS[0])
-        v.lerp_(gradient**2, 1 - BETAS[1])
-        if k % 2 == 0:
-            tensor.mul_(shrink)
-        root = (v / (1 - BETAS[1] ** step)).sqrt_().add_(EPSILON)
-        tensor.addcdiv_(m, root, value=-rate / (1 - BETAS[0] ** step))
+    """Take a step of Adam with decoupled decay; all tensors are of one shape."""
+    first.lerp_(gradient, 1 - BETAS[0])
+    second.lerp_(gradient**2, 1 - BETAS[1])
+    numbers.mul_(shrink)
+    root = (second / (1 - BETAS[1] ** step)).sqrt_().add_(EPSILON)
+    numbers.addcdiv_(first, root, value=-rate / (1 - BETAS[0] ** step))
