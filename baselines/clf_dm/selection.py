@@ -18,6 +18,9 @@ from iflow_gym.baselines.clf_dm.regressors import Regressor
 from iflow_gym.demonstrations import FloatArray
 from iflow_gym.metrics import frechet
 
+Pair = tuple[int, int]
+"""Indices of a V and a regressor."""
+
 STEPS = 333
 """About so many steps has a reproduction in the first pass."""
 
@@ -41,7 +44,7 @@ def best_controller(
     """Return the controller whose reproductions have the least Fréchet distance.
 
     All regressors are tried with the last V, every V with the best of them, and the best of both
-    with each other.
+    with each other. Regressors that are tried with one V run side by side.
 
     Parameters
     ----------
@@ -56,37 +59,66 @@ def best_controller(
     if len(energies) * len(regressors) == 1:
         return controller(energies[0], regressors[0])
     every = max(1, max(len(p) for p in positions) // STEPS)
-    errors: dict[tuple[int, int], float] = {}
 
-    def ranked(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        for i, j in pairs:
-            if (i, j) not in errors:
-                tried = controller(energies[i], regressors[j])
-                errors[i, j] = reproduction_error(tried, positions, dt, every, COMPARED[0])
+    def tried(pairs: Sequence[Pair], every: int, n_compared: int) -> dict[Pair, float]:
+        found: dict[Pair, float] = {}
+        for i in sorted({i for i, _ in pairs}):
+            members = [j for k, j in pairs if k == i]
+            together = SideBySide([regressors[j] for j in members])
+            made = reproduction_errors(
+                controller(energies[i], together), len(members), positions, dt, every, n_compared
+            )
+            found |= {(i, j): error for j, error in zip(members, made, strict=True)}
+        return found
+
+    errors: dict[Pair, float] = {}
+
+    def ranked(pairs: list[Pair]) -> list[Pair]:
+        errors.update(tried([p for p in pairs if p not in errors], every, COMPARED[0]))
         return sorted(pairs, key=errors.__getitem__)
 
     last = len(energies) - 1
     followers = [j for _, j in ranked([(last, j) for j in range(len(regressors))])][:REGRESSORS]
     leaders = [i for i, _ in ranked([(i, followers[0]) for i in range(len(energies))])][:ENERGIES]
     ranked([(i, j) for i in leaders for j in followers])
-    finalists = [
-        controller(energies[i], regressors[j]) for i, j in ranked(list(errors))[:FINALISTS]
-    ]
-    return min(finalists, key=lambda c: reproduction_error(c, positions, dt, 1, COMPARED[1]))
+    finalists = ranked(list(errors))[:FINALISTS]
+    i, j = min(finalists, key=tried(finalists, 1, COMPARED[1]).__getitem__)
+    return controller(energies[i], regressors[j])
 
 
-def reproduction_error(
+class SideBySide:
+    """Regressors as one, which takes as many states for each of them in turn."""
+
+    def __init__(self, regressors: Sequence[Regressor]) -> None:
+        self.regressors = regressors
+
+    def velocity(self, x: FloatArray) -> FloatArray:
+        """Return each regressor's velocities at its own states."""
+        shares = x.reshape(len(self.regressors), -1, x.shape[1])
+        return np.concatenate(
+            [r.velocity(share) for r, share in zip(self.regressors, shares, strict=True)]
+        )
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return all of the regressors' arrays."""
+        return {f"{i}.{k}": a for i, r in enumerate(self.regressors) for k, a in r.arrays().items()}
+
+
+def reproduction_errors(
     controller: Controller,
+    n_regressors: int,
     positions: Sequence[FloatArray],
     dt: FloatArray,
     every: int,
     n_compared: int,
-) -> float:
-    """Return the mean Fréchet distance of reproductions to demonstrations.
+) -> list[float]:
+    """Return each regressor's mean Fréchet distance of reproductions to demonstrations.
 
     Parameters
     ----------
-    controller, positions, dt
+    controller : Controller
+        Its regressor is `n_regressors` side by side, or is one.
+    positions, dt
         As in `best_controller`.
     every : int
         Samples that a step of the reproduction is long.
@@ -94,12 +126,16 @@ def reproduction_error(
         About so many samples of the longest demonstration are compared.
     """
     longest = max(len(p) for p in positions)
-    states = np.stack([p[0] for p in positions])
+    states = np.tile(np.stack([p[0] for p in positions]), (n_regressors, 1))
+    times = np.tile(dt * every, n_regressors)
     path = [states]
     for _ in range((longest - 1) // every):
-        states = controller.step(states, dt * every)
+        states = controller.step(states, times)
         path.append(states)
     thin = max(1, round(longest / every / n_compared))
     made = np.stack(path, axis=1)[:, ::thin]
     shown = [p[:: every * thin] for p in positions]
-    return float(np.mean([frechet(p, q[: len(p)]) for p, q in zip(shown, made, strict=True)]))
+    return [
+        float(np.mean([frechet(p, q[: len(p)]) for p, q in zip(shown, of_one, strict=True)]))
+        for of_one in np.split(made, n_regressors)
+    ]

@@ -16,7 +16,7 @@ from iflow_gym.baselines.clf_dm.energy import (
     learn_energy,
     objective,
 )
-from iflow_gym.baselines.clf_dm.selection import best_controller, reproduction_error
+from iflow_gym.baselines.clf_dm.selection import best_controller, reproduction_errors
 from iflow_gym.baselines.seds import SEDS
 from iflow_gym.datasets.lasa import load_lasa
 from iflow_gym.demonstrations import Demonstrations
@@ -169,7 +169,7 @@ def test_the_pair_that_made_the_demonstrations_is_found_again():
         found = best_controller(energies, regressors, controller, positions, dt)
         assert found.regressor is regressor
         assert found.energy is energy
-        assert reproduction_error(found, positions, dt, 1, 250) == 0.0
+        assert reproduction_errors(found, 1, positions, dt, 1, 250) == [0.0]
 
 
 # The correction -----------------------------------------------------------------------------
