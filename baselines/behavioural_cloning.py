@@ -138,18 +138,17 @@ class BehaviouralCloning(DynamicalSystem):
     ) -> None:
         self.layers_ = tuple(layers)
         self.centre_, self.length_, self.speed_ = centre, float(length), float(speed)
-        # tanh z = 2 sigmoid(2 z) - 1: the network of sigmoids that takes x and gives velocities.
+        # tanh z = 2 sigmoid(2 z) - 1: the network of sigmoids, of offsets in length.
         w1, b1, w2, b2, w3, b3 = self.layers_
-        w1 = w1 / self.length_
         self._sigmoid_layers = (
-            *(2 * w1, 2 * (b1 - centre @ w1)),
+            *(2 * w1 / self.length_, 2 * b1),
             *(4 * w2, 2 * (b2 - w2.sum(axis=0))),
             *(2 * self.speed_ * w3, self.speed_ * (b3 - w3.sum(axis=0))),
         )
 
     def _velocity(self, x: FloatArray) -> FloatArray:
         w1, b1, w2, b2, w3, b3 = self._sigmoid_layers
-        hidden = _sigmoid(x @ w1, b1)
+        hidden = _sigmoid((x - self.centre_) @ w1, b1)
         return np.asarray(_sigmoid(hidden @ w2, b2) @ w3 + b3)
 
     @property

@@ -83,8 +83,8 @@ class DMP(MovementPrimitive):
     Attributes
     ----------
     given_start_ : GivenStart or None
-        Weights, shape (n_basis, d), and the first y', shape (d,), given the start, as one vector;
-        in length. None for a motion that repeats.
+        Of weights, shape (n_basis, d), and the first y', shape (d,), as one vector, in length: its
+        `coefficients` are what they are made of. None for a motion that repeats.
     weights_ : array, shape (n_basis, d)
         Of a motion that repeats; of one that ends, the mean start's.
 
@@ -175,7 +175,7 @@ class DMP(MovementPrimitive):
             phase = nearest_phase(offset, self._orbit)
             velocity = self._orbit_velocity[np.rint(phase * ORBIT).astype(int) % ORBIT]
             return {**state, "phase": phase, "velocity": velocity}
-        factors, _ = self.given_start_(offset)
+        factors, _ = self.given_start_.factors(offset)
         velocity = factors @ self.given_start_.coefficients[:, -x.shape[1] :]
         return {**state, "start": offset, "factors": factors, "velocity": velocity}
 

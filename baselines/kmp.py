@@ -135,7 +135,11 @@ class KMP(MovementPrimitive):
 
     def _begin(self, x: FloatArray, state: PhaseState) -> PhaseState:
         state = {**state, "factors": with_one(x - self._goal)}
-        return {**state, "reference": self._reference(state, state["phase"])}
+        return {**state, **self._reached(state, state["phase"])}
+
+    def _reached(self, state: PhaseState, phase: FloatArray) -> PhaseState:
+        """Return r(s), as `_reference` does, and what s it is of: the next step begins there."""
+        return {"reference": self._reference(state, phase), "reference_phase": phase}
 
     def _reference(self, state: PhaseState, phase: FloatArray) -> FloatArray:
         """Return r(s), shape (n, d), as an offset from the goal, which it is at from s = 1 on."""
@@ -149,10 +153,13 @@ class KMP(MovementPrimitive):
     def _advance(
         self, x: FloatArray, state: PhaseState, phase: FloatArray, dt: FloatArray
     ) -> tuple[FloatArray, PhaseState]:
-        there = self._reference(state, phase)
+        if not np.array_equal(state["reference_phase"], state["phase"]):  # put there by a caller
+            state = {**state, **self._reached(state, state["phase"])}
+        there = self._reached(state, phase)
         elapsed = phase - state["phase"]
-        offset = tracked(x - self._goal, state["reference"], there, self.config.feedback, elapsed)
-        return offset + self._goal, {"reference": there}
+        references = state["reference"], there["reference"]
+        offset = tracked(x - self._goal, *references, self.config.feedback, elapsed)
+        return offset + self._goal, there
 
     @property
     def guarantee(self) -> Guarantee:

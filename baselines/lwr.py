@@ -180,7 +180,9 @@ class LocalFits:
         """Return the fits' values, shape (n, k), at positions x, shape (n, d), in bandwidths."""
         (n, d), k = x.shape, self._n_outputs
         weights = self._kernels.exponents(x)
-        if not weights.max(axis=1).min(initial=0.0) > SMALL:
+        greatest = weights.max(axis=1)
+        # Above 1 where, unlikely far away, the digits of a distance are lost.
+        if not (greatest.min(initial=0.0) > SMALL and greatest.max(initial=0.0) < 1):
             weights = self._kernels.relative_exponents(x)
         sums = (exp2_(weights) @ self._moments).T
         sums = sums / sums[0]

@@ -198,9 +198,13 @@ class ProMP(MovementPrimitive):
         if self._rhythmic:
             state = {**state, "phase": nearest_phase(offset, self._orbit)}
         else:
-            factors, rest = self._given_start(offset)
+            factors, rest = self._given_start.factors(offset)
             state = {**state, "factors": factors, "rest": rest}
-        return {**state, "reference": self._reference(state, state["phase"])}
+        return {**state, **self._reached(state, state["phase"])}
+
+    def _reached(self, state: PhaseState, phase: FloatArray) -> PhaseState:
+        """Return r(s), as `_reference` does, and what s it is of: the next step begins there."""
+        return {"reference": self._reference(state, phase), "reference_phase": phase}
 
     def _reference(self, state: PhaseState, phase: FloatArray) -> FloatArray:
         """Return r(s), shape (n, d), as an offset from the goal or the cycle's mean.
@@ -220,10 +224,13 @@ class ProMP(MovementPrimitive):
     def _advance(
         self, x: FloatArray, state: PhaseState, phase: FloatArray, dt: FloatArray
     ) -> tuple[FloatArray, PhaseState]:
-        there = self._reference(state, phase)
+        if not np.array_equal(state["reference_phase"], state["phase"]):  # put there by a caller
+            state = {**state, **self._reached(state, state["phase"])}
+        there = self._reached(state, phase)
         elapsed = phase - state["phase"]
-        offset = tracked(x - self._centre, state["reference"], there, self.config.feedback, elapsed)
-        return offset + self._centre, {"reference": there}
+        references = state["reference"], there["reference"]
+        offset = tracked(x - self._centre, *references, self.config.feedback, elapsed)
+        return offset + self._centre, there
 
     @property
     def guarantee(self) -> Guarantee:

@@ -69,7 +69,7 @@ class GivenStart(NamedTuple):
         """What the numbers are made of, shape (1 + d, k): mu_w, and what a unit of offset adds."""
         return np.vstack([self.mean, self.slope.T])
 
-    def __call__(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def factors(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what `coefficients` are multiplied by for starts x, shape (n, d), and a rest.
 
         The factors, shape (n, 1 + d), are 1 and the offset from mu_x, shortened; the rest, shape

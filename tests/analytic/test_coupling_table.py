@@ -1,5 +1,7 @@
 """Layers that are looked up, against layers whose units are evaluated."""
 
+import pickle
+
 import numpy as np
 import pytest
 from imitation_flow_parts import as_field, flow_arrays, random_flow
@@ -30,16 +32,38 @@ class TestATabulatedFlow:
     def test_is_the_flow(self, d, scale, by_units):
         """Within the table, in and out of it, and outside."""
         field, z = as_field(flow_arrays(random_flow(d))), states(d, scale)
-        table = coupling_table.table_of(field.arrays, field.bound)
+        table = field._table
         outside = np.isnan(table.forward(z)).any(axis=1)
         assert outside.any() == (scale > 1)
         assert outside.all() == (scale > 100)
         y = field.forward(z)
         back, log_det = field.inverse(y)
         expected, expected_log_det = by_units(field.inverse, y)
+        inside = ~outside
+        np.testing.assert_array_equal(y[inside], table.forward(z)[inside])
         np.testing.assert_allclose(y, by_units(field.forward, z), rtol=0, atol=1e-9 * scale)
         np.testing.assert_allclose(back, expected, rtol=0, atol=1e-9 * scale)
         np.testing.assert_allclose(log_det, expected_log_det, rtol=0, atol=1e-9)
+
+    def test_has_its_origin_where_the_flow_has_it(self, d):
+        """So a goal is at rest in a batch as it is alone."""
+        field = as_field(flow_arrays(random_flow(d)))
+        origin, _ = field.inverse(np.zeros((1, d)))
+        goals = np.zeros((200, d))
+        np.testing.assert_allclose(field.inverse(goals)[0], origin + goals, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(field.forward(origin + goals), goals, rtol=0, atol=1e-14)
+
+    def test_is_left_to_units_where_states_are_few(self, d, by_units):
+        field, z = as_field(flow_arrays(random_flow(d))), states(d, 1.0, coupling.TABULATED - 1)
+        np.testing.assert_array_equal(field.forward(z), by_units(field.forward, z))
+        assert "_table" not in vars(field)
+
+    def test_is_no_part_of_copies(self, d):
+        field, z = as_field(flow_arrays(random_flow(d))), states(d, 1.0)
+        y = field.forward(z)
+        text = pickle.dumps(field)
+        assert len(text) < 50_000
+        np.testing.assert_array_equal(pickle.loads(text).forward(z), y)
 
     def test_is_inverted_to_rounding(self, d):
         """Since the way back divides by what the way there multiplied with."""
@@ -67,7 +91,7 @@ def test_functions_too_steep_for_the_table_are_evaluated(by_units):
     arrays = flow_arrays(random_flow(2))
     arrays["hidden_weight"][3] *= 1e3
     field, z = as_field(arrays), states(2, 1.0)
-    assert coupling_table.table_of(field.arrays, field.bound) is None
+    assert field._table is None
     np.testing.assert_array_equal(field.forward(z), by_units(field.forward, z))
 
 
@@ -76,17 +100,17 @@ def test_a_larger_table_where_a_small_one_does_not_do(by_units):
     arrays["hidden_weight"][3] *= 3
     field, z = as_field(arrays), states(2, 1.0)
     small, large = (
-        coupling_table.CouplingTable(field.arrays, field.bound, n).error
+        coupling_table.CouplingTable(field.arrays, field.bound, np.zeros(2), n).error
         for n in coupling_table.N_CELLS
     )
     assert large < coupling_table.TOLERANCE < small < 2.0**7 * large
-    assert coupling_table.table_of(field.arrays, field.bound).error == large
+    assert field._table.error == large
     np.testing.assert_allclose(field.forward(z), by_units(field.forward, z), rtol=0, atol=1e-9)
 
 
 def test_scales_whose_product_has_no_logarithm_are_evaluated(by_units):
     field, y = as_field(flow_arrays(random_flow(2)), bound=50), states(2, 1.0)
-    assert coupling_table.table_of(field.arrays, field.bound) is None
+    assert field._table is None
     np.testing.assert_array_equal(field.inverse(y)[1], by_units(field.inverse, y)[1])
 
 

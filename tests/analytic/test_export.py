@@ -146,9 +146,12 @@ def test_every_emission_over_a_cycle(d, emission, tmp_path):
     session = loaded(export(parts, tmp_path / "model.onnx"))
     got, rate = session.run(None, {"x": x, "dt": np.array([0.3])})
     # A batch of couplings is looked up: see `coupling_table`.
-    np.testing.assert_allclose(got, step(parts, x, np.full(len(x), 0.3)), rtol=0, atol=1e-9)
+    tables = 10 if emission == "coupling" and d < 4 else 1
+    expected = step(parts, x, np.full(len(x), 0.3))
+    np.testing.assert_allclose(got, expected, rtol=0, atol=tables * 1e-10)
     expected = velocity(parts, x)
-    np.testing.assert_allclose(rate, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(rate, expected, rtol=0, atol=tables * 1e-12 * size)
 
 
 def test_a_file_without_the_velocity(tmp_path):

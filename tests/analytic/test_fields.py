@@ -80,10 +80,12 @@ def test_inputs_stay_as_they_are():
     np.testing.assert_array_equal(z, before)
 
 
-def test_threads_do_not_meet():
-    field = as_field(flow_arrays(random_flow(2)))
-    batches = np.random.default_rng(0).normal(size=(16, 800, 2))
-    alone = [field.forward(z) for z in batches]
+@pytest.mark.parametrize("d", [2, 5])
+def test_threads_do_not_meet(d):
+    """By tables, which the first of them make, and by units."""
+    field, fresh = (as_field(flow_arrays(random_flow(d))) for _ in range(2))
+    batches = np.random.default_rng(0).normal(size=(16, 800, d))
+    alone = [fresh.forward(z) for z in batches]
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(field.forward, batches))
     np.testing.assert_array_equal(together, alone)

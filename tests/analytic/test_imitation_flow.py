@@ -69,6 +69,9 @@ class TestModel:
         np.testing.assert_allclose(fitted.step(angle.goal, 1.0), angle.goal, atol=1e-10)
         far = fitted.rollout(states(angle, 5), 1, 100.0)[:, -1]
         np.testing.assert_allclose(far, np.zeros((5, 2)), atol=1e-6)
+        many = np.tile(angle.goal, (200, 1))  # looked up
+        np.testing.assert_allclose(fitted.step(many, 1.0), many, atol=1e-11)
+        assert (fitted.lyapunov(many) < 1e-24).all()
 
     def test_lyapunov_function_decreases_and_its_rate_is_the_derivative(self, angle, fitted):
         x, h = 3 * states(angle, 200), 1e-5

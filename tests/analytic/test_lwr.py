@@ -60,6 +60,13 @@ def test_weights_that_all_underflow_are_relative_to_the_nearest_samples():
             np.testing.assert_allclose(found, mean_v + (x - mean_x) @ slopes, rtol=1e-6)
 
 
+def test_where_distances_have_no_digits_left_it_is_finite():
+    rng = np.random.default_rng(0)
+    samples, values = rng.normal(size=(40, 2)), rng.normal(size=(40, 2))
+    fits = LocalFits(1e10 + samples, values, 1e-3)
+    assert np.isfinite(fits(1e10 + rng.normal(size=(20, 2)))).all()
+
+
 def test_the_bandwidth_has_the_least_error_on_what_is_left_out():
     """A wave that all demonstrations show asks for a small one, noise for a large one."""
     rng = np.random.default_rng(0)

@@ -90,6 +90,19 @@ def test_motions_at_different_phases_go_on_as_each_alone(name):
     np.testing.assert_allclose(after(starts, first), alone, atol=1e-10)
 
 
+@pytest.mark.parametrize("name", ["promp", "kmp", "dmp"])
+def test_a_caller_may_put_the_phase(name):
+    """As who stops a motion and goes on from another place of it does."""
+    shown = load_lasa("Sshape")
+    primitive = load_method(name)().fit(shown, seed=0)
+    begun = primitive.begin(shown.starts[:3])
+    _, later = primitive.advance(shown.starts[:3], begun, 0.3)
+    put = {**begun, "phase": later["phase"], "velocity": later.get("velocity")}
+    x = shown.starts[:3] + 2.0
+    found, expected = (primitive.advance(x, state, 0.1)[0] for state in (put, later))
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
 # The start ----------------------------------------------------------------------------------
 
 
@@ -101,7 +114,7 @@ def test_numbers_given_the_start_are_a_conditional_gaussian_mean():
     noise = EXACTNESS * np.trace(joint[:2, :2]) / 2 * np.eye(2)
     gain = joint[2:, :2] @ np.linalg.inv(joint[:2, :2] + noise)
     expected = values.mean(axis=0) + (starts - starts.mean(axis=0)) @ gain.T
-    factors, rest = given(starts)
+    factors, rest = given.factors(starts)
     np.testing.assert_allclose(factors @ given.coefficients, expected, atol=1e-12)
     np.testing.assert_allclose(rest, 0.0, atol=1e-12)
 
@@ -110,14 +123,14 @@ def test_beyond_the_demonstrated_starts_the_rest_is_given_back():
     rng = np.random.default_rng(0)
     given = GivenStart.fit(rng.normal(size=(9, 2)), rng.normal(size=(9, 5)))
     direction = np.array([[0.6, -0.8]])
-    near, far = (given(given.start + factor * direction) for factor in (50.0, 5000.0))
+    near, far = (given.factors(given.start + factor * direction) for factor in (50.0, 5000.0))
     np.testing.assert_allclose(near[0], far[0])
     np.testing.assert_allclose(far[1] - near[1], 4950 * direction)
 
 
 def test_starts_in_one_place_say_nothing():
     given = GivenStart.fit(np.ones((4, 2)), np.arange(12.0).reshape(4, 3))
-    factors, rest = given(np.array([[5.0, 1.0]]))
+    factors, rest = given.factors(np.array([[5.0, 1.0]]))
     np.testing.assert_array_equal(factors @ given.coefficients, [[4.5, 5.5, 6.5]])
     np.testing.assert_array_equal(rest, [[4.0, 0.0]])
 

@@ -32,14 +32,13 @@ from iflow_gym.baselines.imitation_flow.fields.base import (
     check_orthogonal,
     check_shapes,
 )
-from iflow_gym.baselines.imitation_flow.fields.coupling_table import CouplingTable, table_of
+from iflow_gym.baselines.imitation_flow.fields.coupling_table import BLOCK, CouplingTable, table_of
 from iflow_gym.demonstrations import FloatArray
 
 TABULATED = 128
-"""States from which on a table is faster than the units; with 64 it is as fast."""
+"""States from which on tables, which take the time of 100 000 states to make, are faster than units.
 
-BLOCK = 1024
-"""Points that go through the layers together: their units then stay in the processor's cache."""
+With 64 they are as fast. A batch and its states one by one then differ by the tables' error."""
 
 
 class Stage(NamedTuple):
@@ -121,7 +120,14 @@ class CouplingField(FlowField):
     @cached_property
     def _table(self) -> CouplingTable | None:
         """The layers by a table, where they can be: one kept coordinate, smooth functions."""
-        return table_of(self.arrays, self.bound) if self.n_kept == 1 else None
+        if self.n_kept != 1:
+            return None
+        origin, _ = self._back_by_units(np.zeros((1, self.n_dims)))
+        return table_of(self.arrays, self.bound, origin[0])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the tables out of copies: they are megabytes, and made anew."""
+        return {name: value for name, value in vars(self).items() if name != "_table"}
 
     def _by_units(self, z: FloatArray) -> FloatArray:
         y = np.empty(z.shape)

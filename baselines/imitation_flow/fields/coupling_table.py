@@ -4,8 +4,12 @@ Where a layer keeps one coordinate, in two and three dimensions, the scale exp(s
 that it gives the others are functions of one number u, and a layer is a table. Between its knots
 each function is the quintic that has its value and its first two derivatives at both of them
 (Hermite interpolation, e.g. de Boor, A Practical Guide to Splines, 2001, chapter I), with as many
-cells as bring it within `TOLERANCE` of the functions. No unit's tanh is taken, and the layers are a
-diffeomorphism still, whatever a table holds: what divides on the way back is what multiplied.
+cells as bring it within `TOLERANCE` of the functions, and no unit's tanh is taken.
+
+Such layers are a diffeomorphism of their own: their scales are positive, and what divides on the way
+back is what multiplied. A translation, of the size of the error, lets it have 0 where the layers have
+it, so that a goal there is one of the tabulated flow as well. A state that leaves the tables is none
+of theirs; where the layers answer for it, the two meet in a step of the size of the error.
 """
 
 from __future__ import annotations
@@ -25,13 +29,16 @@ N_CELLS = (4096, 8192)
 """Sizes of a table, tried in turn: the smaller one stays in the processor's cache."""
 
 TOLERANCE = 1e-10
-"""How far a table may be from its functions in the middle of a cell, where it is worst."""
+"""How far a table may be from its functions where it is about worst, near the middle of a cell."""
+
+TRANSLATION = 1e-8
+"""How far tables may take the origin from where the layers take it to."""
 
 GREATEST_LOG = 300.0
 """Of the logarithm of a product of all layers' scales, which is taken once."""
 
 BLOCK = 1024
-"""Points that go through the layers together."""
+"""Points that go through the layers together: what is computed of them stays in the cache."""
 
 _QUINTIC = np.array(
     [
@@ -45,15 +52,18 @@ _QUINTIC = np.array(
 )
 """Coefficients of x^5 to 1 from f(0), f(1), f'(0), f'(1), f''(0), f''(1)."""
 
-_MIDDLE = 0.5 ** np.arange(5, -1, -1)
+_INSIDE = 0.4
+"""Where in a cell the error is taken: beside the middle, where a symmetric function would have none."""
 
 
-def table_of(arrays: Mapping[str, FloatArray], bound: float) -> CouplingTable | None:
-    """Return the smallest table that is within `TOLERANCE`, None where there is none."""
+def table_of(
+    arrays: Mapping[str, FloatArray], bound: float, origin: FloatArray
+) -> CouplingTable | None:
+    """Return the smallest table that is as exact as it has to be, None where there is none."""
     if len(arrays["rotation"]) * bound > GREATEST_LOG:
         return None
-    tables = (CouplingTable(arrays, bound, n_cells) for n_cells in N_CELLS)
-    return next((table for table in tables if table.error <= TOLERANCE), None)
+    tables = (CouplingTable(arrays, bound, origin, n_cells) for n_cells in N_CELLS)
+    return next((table for table in tables if table.is_exact), None)
 
 
 class _Weights(NamedTuple):
@@ -85,24 +95,37 @@ class CouplingTable:
         `CouplingField.arrays`.
     bound : float
         Of the log-scales.
+    origin : array, shape (d,)
+        What the layers take to 0.
     n_cells : int
         Of the table.
     """
 
-    def __init__(self, arrays: Mapping[str, FloatArray], bound: float, n_cells: int) -> None:
+    def __init__(
+        self, arrays: Mapping[str, FloatArray], bound: float, origin: FloatArray, n_cells: int
+    ) -> None:
         rotation = arrays["rotation"]
         self.n_dims = rotation.shape[1]
         self._enter = _with_place(np.eye(self.n_dims), n_cells)
         self._layers: list[_Layer] = []
         self.error = 0.0
-        """The greatest one in the middle of a cell, relative for the scales."""
+        """The greatest one of a layer, relative for the scales."""
         weights = (arrays[name] for name in _Weights._fields)
         for turn, *values in zip(rotation, *weights, strict=True):
             table, error = _table(_Weights(*values), bound, n_cells)
             there, back = _with_place(turn, n_cells), _with_place(turn.T, n_cells)
             self._layers.append(_Layer(there, back, table))
             self.error = max(self.error, error)
+        self._translation = np.zeros(self.n_dims)
+        self._translation = self.forward(origin[None])[0]
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether the table may stand for the layers."""
+        translation = np.abs(self._translation).max()  # NaN where the origin is outside
+        return bool(self.error <= TOLERANCE and translation <= TRANSLATION)
+
+    @np.errstate(invalid="ignore")  # the cell of NaN
     def forward(self, z: FloatArray) -> FloatArray:
         """Return y = h(z), both (n, d)."""
         y = np.empty(z.shape)
@@ -116,13 +139,15 @@ class CouplingTable:
                 moved += work.shift
                 before, after = after, before
             y[rows] = before.state.T
+        y -= self._translation
         return y
 
+    @np.errstate(invalid="ignore")
     def inverse(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return z = h^-1(y), (n, d), and log |det dz/dy|, (n,)."""
         z, log_det = np.empty(y.shape), np.empty(len(y))
         for rows, work in self._blocks(len(y)):
-            after, before = work.start(y[rows])
+            after, before = work.start(y[rows] + self._translation)
             np.dot(self._enter, after.seen, before.turned)
             total = np.ones(work.scale.shape)
             for layer in reversed(self._layers):
@@ -137,10 +162,9 @@ class CouplingTable:
         return z, log_det
 
     def _blocks(self, n: int) -> Iterator[tuple[slice, _Work]]:
-        with np.errstate(invalid="ignore"):  # the cell of NaN
-            for start in range(0, n, BLOCK):
-                rows = slice(start, min(start + BLOCK, n))
-                yield rows, _Work(self.n_dims, rows.stop - start)
+        for start in range(0, n, BLOCK):
+            rows = slice(start, min(start + BLOCK, n))
+            yield rows, _Work(self.n_dims, rows.stop - start)
 
 
 class _State(NamedTuple):
@@ -199,14 +223,15 @@ def _with_place(rotation: FloatArray, n_cells: int) -> FloatArray:
 
 
 def _table(weights: _Weights, bound: float, n_cells: int) -> tuple[FloatArray, float]:
-    """Return a layer's table, and its error in the middle of cells, relative for the scales."""
+    """Return a layer's table and its greatest error, of scales a relative one."""
     step = 2 * REACH / n_cells
     knots = np.linspace(-REACH, REACH, n_cells + 1)
     ends = [f * step**k for k, f in enumerate(_functions(knots, weights, bound))]
     left_right = np.stack([f[:, cells] for f in ends for cells in (slice(-1), slice(1, None))])
     coefficients = np.tensordot(_QUINTIC, left_right, 1)
-    exact, _, _ = _functions(knots[:-1] + step / 2, weights, bound)
-    error = np.abs(np.tensordot(_MIDDLE, coefficients, 1) - exact)
+    exact, _, _ = _functions(knots[:-1] + _INSIDE * step, weights, bound)
+    found = np.tensordot(_INSIDE ** np.arange(5, -1, -1), coefficients, 1)
+    error = np.abs(found - exact)
     n_moved = len(exact) // 2
     error[:n_moved] /= exact[:n_moved]
     table = np.full((6, len(exact), n_cells + 2), np.nan)
