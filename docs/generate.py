@@ -80,6 +80,12 @@ class Family:
 
 SHAPES = (*SINGLE_MOTIONS, *MULTI_MODELS)
 
+
+def within(entry: type) -> str:
+    """Return a class's docstring as a part of a page that is another's, its headings lower."""
+    return re.sub(r"^#", "##", inspect.getdoc(entry) or "", flags=re.MULTILINE)
+
+
 FAMILIES = (
     Family(
         "point-mass",
@@ -114,7 +120,9 @@ FAMILIES = (
         "The suite's letters beside recorded ones",
         members=tuple(letter_id(letter) for letter in LETTERS),
         facts=True,
-        more="[How the letters are made](../letters.md), and how they compare with recorded ones.",
+        more="[How the letters are made](../letters.md), and how they compare with recorded ones. "
+        "`iflow_gym.classification.TrajectoryClassifier` tells which letter a recording shows, by "
+        "one fitted model of each; the leaderboard has how often it is right.",
     ),
     Family(
         "letter-recorded",
@@ -141,13 +149,13 @@ FAMILIES = (
         more=f"""With your own recordings: `iflow_gym.envs.disturbed.DisturbedEnv(demonstrations)`.
 [Residuals on a learned motion](../residual.md) are what it is for.
 
-# The plant
+## The plant
 
-{inspect.getdoc(DisturbedEnv)}
+{within(DisturbedEnv)}
 
-# Wind
+## Wind
 
-{inspect.getdoc(Wind)}
+{within(Wind)}
 
 By default `strength` is {Wind.strength}, `curl` {Wind.curl}, `reach` {Wind.reach} and `direction`
 {tuple(Wind().unit(2).tolist())}.""",
