@@ -100,10 +100,17 @@ class ConditionalImitationFlow:
 
         Raises
         ------
+        TypeError
+            For a single motion.
         ValueError
             For motions that repeat or differ in dimension, and for contexts that do not tell them
             apart.
         """
+        if isinstance(motions, Demonstrations):
+            raise TypeError(
+                f"Expected a sequence of motions, got {motions.name!r} alone: give a list of them, "
+                "or fit an ImitationFlow to one."
+            )
         if not motions:
             raise ValueError("Expected at least one motion, got none.")
         probe = ImitationFlow(self.config)
@@ -144,15 +151,26 @@ class ConditionalImitationFlow:
         Parameters
         ----------
         context : array, shape (k,)
-            One that was fitted, or any other: between two motions the field is between theirs.
+            One that was fitted, or any other: between two motions the field is between theirs, and
+            ends where the nearer one does.
         goal : array, shape (d,), optional
             Where the motion ends: the field is shifted there. Left out, it is the goal of the
             fitted context that is nearest.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        ValueError
+            For what is no context or no goal.
         """
         if not hasattr(self, "_arrays"):
             raise NotFittedError("ConditionalImitationFlow has not been fitted: call fit first.")
-        wanted = np.asarray(context, dtype=np.float64)
         fitted = self._arrays["contexts"]
+        try:
+            wanted = np.asarray(context, dtype=np.float64)
+        except (TypeError, ValueError):
+            wanted = np.empty(0)
         if wanted.shape != fitted.shape[1:] or not np.isfinite(wanted).all():
             raise ValueError(
                 f"Expected a finite context of shape {fitted.shape[1:]}, got {context!r}."

@@ -236,7 +236,8 @@ def without_gaps(
 def trimmed(recording: RawRecording, still: float = STILL) -> tuple[RawRecording, Note | None]:
     """Return the samples from where the motion begins to where it ends.
 
-    What is slower than `still` times the fast speed is still. The speed is that of a parabola
+    What is slower than `still` times the fast speed is still, and so is what the samples' scatter
+    does not let tell from it, three deviations of a slope. The speed is that of a parabola
     through a twenty-fifth of the recording (Savitzky and Golay, Analytical Chemistry 36(8), 1964).
     Of samples that scatter a still hand seems to move now and then: what leads no further than
     `LEAST_WAY` of the diagonal, or `SCATTERS` times the scatter, counts as still as well. Pauses
@@ -257,7 +258,9 @@ def trimmed(recording: RawRecording, still: float = STILL) -> tuple[RawRecording
     rough = scatter(recording)
     # Of a straight line through m samples that scatter by s, the slope scatters by this.
     noise = rough * np.sqrt(12 / window**3) / step
-    fast = speed > max(still * float(np.percentile(speed, FAST)), 3 * noise)
+    usual = float(np.percentile(speed, FAST))
+    least_speed = max(still * usual, 3 * noise)
+    fast = speed > least_speed
     edges = np.flatnonzero(np.diff(np.concatenate([[False], fast, [False]]).astype(np.int8)))
     least = max(LEAST_WAY * recording.diagonal, SCATTERS * rough)
     runs = [
@@ -292,7 +295,13 @@ def trimmed(recording: RawRecording, still: float = STILL) -> tuple[RawRecording
         if count
     ]
     values = {"start": start, "end": end, "start_seconds": seconds[0], "end_seconds": seconds[1]}
-    return kept, Note("trim", recording.name, f"trimmed {' and '.join(parts)}: still", values)
+    why = "still"
+    if least_speed > still * usual:
+        why = (
+            f"slower than {least_speed / usual:.0%} of the fast speed, where its scatter hides "
+            f"whether it moves; they lead over {share:.1%} of its diagonal (--no-trim keeps them)"
+        )
+    return kept, Note("trim", recording.name, f"trimmed {' and '.join(parts)}: {why}", values)
 
 
 def resampled(

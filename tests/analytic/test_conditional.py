@@ -141,8 +141,11 @@ def test_what_cannot_be_told_apart_is_refused(two, model):
     cycle = Demonstrations.from_arrays([circle], dt=0.1, period=5.0)
     with pytest.raises(ValueError, match="motions that end"):
         fit([cycle, two[0]], seed=0)
-    with pytest.raises(ValueError, match=r"context of shape \(2,\)"):
-        model.at([1.0])
+    with pytest.raises(TypeError, match="a sequence of motions, got 'LASA-Multi_Models_4' alone"):
+        fit(two[0], seed=0)
+    for wrong in ([1.0], "Angle"):
+        with pytest.raises(ValueError, match=r"context of shape \(2,\)"):
+            model.at(wrong)
     with pytest.raises(ValueError, match=r"goal of shape \(2,\)"):
         model.at([0.0, 3.0], goal=[1.0])
     with pytest.raises(ValueError, match="noise='additive' for several motions"):

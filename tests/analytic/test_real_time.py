@@ -66,6 +66,20 @@ def assert_is_the_batch(parts, x):
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("emission", EMISSIONS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_measurement_that_is_no_number_leaves_nothing_behind(d, emission, bad):
+    stepper = RealTimeStepper(dynamics(d, emission=emission))
+    good, poor = states(stepper.dynamics, n=1)[0], np.full(d, bad)
+    before = stepper.step(good, 0.1), stepper.velocity(good)
+    with np.errstate(invalid="ignore"):
+        assert not np.isfinite(stepper.step(poor, 0.1)).any()
+        assert not np.isfinite(stepper.velocity(poor)).any()
+    np.testing.assert_array_equal(stepper.step(good, 0.1), before[0])
+    np.testing.assert_array_equal(stepper.velocity(good), before[1])
+
+
 @pytest.mark.parametrize("d", [2, 3, 6])
 @pytest.mark.parametrize("latent", [linear_latent, cycle_latent])
 @pytest.mark.parametrize("emission", EMISSIONS)

@@ -79,7 +79,8 @@ class SpacePoint:
         layer = _weights(field)
         (n_layers, d, _), n_hidden = layer.rotation.shape, layer.weight.shape[1]
         self._bound, self._n_dims = field.bound, d
-        self._states = np.ones((2, d + 1 + n_hidden))
+        self._states = np.empty((2, d + 1 + n_hidden))
+        self._start = self._states[0, : d + 1]
         self._tangent, self._turned = np.empty(d), np.empty(d + n_hidden)
         self._slopes = np.empty(n_hidden)
         self._out, self._d_out = np.empty(2), np.empty(2)
@@ -133,7 +134,7 @@ class SpacePoint:
     def forward(self, z: Vector) -> Vector:
         """Return h(z)."""
         out, bound, activate = self._out, self._bound, np.tanh
-        self._states[0, : self._n_dims] = z
+        self._start[:] = (*z, 1.0)
         for (first, before, after, _, _), stages in self._steps:
             first(before, after)
             for i, argue, state, units, shown, second, *_ in stages:
@@ -149,7 +150,7 @@ class SpacePoint:
     def inverse(self, y: Vector) -> Vector:
         """Return h^-1(y)."""
         out, bound, places, activate = self._outs, self._bound, self._places, np.tanh
-        self._states[0, : self._n_dims] = y
+        self._start[:] = (*y, 1.0)
         for (first, before, after, units, shown), second, (constant, shrink) in self._back:
             first(before, after)
             activate(units, units)
@@ -166,7 +167,7 @@ class SpacePoint:
         d, bound, out, d_out = self._n_dims, self._bound, self._out, self._d_out
         turned, tangent = self._turned, self._tangent
         d_state = turned[:d]
-        self._states[0, :d] = z
+        self._start[:] = (*z, 1.0)
         tangent[:] = dz
         for (first, before, after, _, _), third, d_after, stages in self._tangents:
             first(before, after)

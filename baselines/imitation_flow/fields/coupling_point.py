@@ -35,7 +35,8 @@ class SpacePoint:
         self._bound, self._n_dims = field.bound, d
         n_moved = d - k
         self._places = [(k + j, j, n_moved + j) for j in range(n_moved)]
-        self._states = np.ones((2, d + 1 + n_hidden))
+        self._states = np.empty((2, d + 1 + n_hidden))
+        self._start = self._states[0, : d + 1]
         self._tangent, self._turned = np.empty(d), np.empty(d + n_hidden)
         self._slopes = np.empty(n_hidden)
         self._out, self._d_out = np.empty(2 * n_moved), np.empty(2 * n_moved)
@@ -53,7 +54,7 @@ class SpacePoint:
     def forward(self, z: Vector) -> Vector:
         """Return h(z)."""
         out, bound, places, activate = self._out, self._bound, self._places, np.tanh
-        self._states[0, : self._n_dims] = z
+        self._start[:] = (*z, 1.0)
         for (first, before, after, units, shown), second in self._steps:
             first(before, after)
             activate(units, units)
@@ -67,7 +68,7 @@ class SpacePoint:
     def inverse(self, y: Vector) -> Vector:
         """Return h^-1(y)."""
         out, bound, places, activate = self._out, self._bound, self._places, np.tanh
-        self._states[0, : self._n_dims] = y
+        self._start[:] = (*y, 1.0)
         for (first, before, after, units, shown), second in self._back:
             first(before, after)
             activate(units, units)
@@ -84,7 +85,7 @@ class SpacePoint:
             self._n_dims, self._bound, self._slopes, self._turned, self._d_out,
         )  # fmt: skip
         d_units, tangent = turned[d:], self._tangent
-        self._states[0, :d] = z
+        self._start[:] = (*z, 1.0)
         tangent[:] = dz
         for ((first, before, after, units, shown), second), third, fourth in self._tangents:
             first(before, after)

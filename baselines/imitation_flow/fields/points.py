@@ -145,7 +145,8 @@ def chain(
     Parameters
     ----------
     states : array, shape (2, d + 1 + h)
-        The work vectors, with a constant 1 at d; the units of a layer may be fewer.
+        The work vectors; the units of a layer may be fewer. Every run begins with a state and a 1
+        at d of the first one: the 1 is a product like the others, so that a NaN takes it along.
     turns : array, shape (layers, d, d)
     seen, bias : arrays, shape (layers, h, d) and (layers, h, 1)
         Of the units, by u.

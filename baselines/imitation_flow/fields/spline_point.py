@@ -26,7 +26,8 @@ class SplinePoint:
         d, k, n_bins, n_hidden = field.n_dims, field.n_kept, field.n_bins, weight.shape[1]
         self._bound, self._n_dims, self._n_bins = field.bound, d, n_bins
         self._n_moved = n_moved = d - k
-        self._states = np.ones((2, d + 1 + n_hidden))
+        self._states = np.empty((2, d + 1 + n_hidden))
+        self._start = self._states[0, : d + 1]
         self._tangent, self._turned = np.empty(d), np.empty(d + n_hidden)
         self._slopes = np.empty(n_hidden)
         bounds, out_weight, out_bias = rows_of(field)
@@ -61,7 +62,7 @@ class SplinePoint:
         """Return h(z)."""
         out, sums, bound, last = self._out, self._sums, self._bound, self._n_bins - 1
         n_moved, length = self._n_moved, 2 * self._bound
-        self._states[0, : self._n_dims] = z
+        self._start[:] = (*z, 1.0)
         for (first, before, after, units, shown), second in self._steps:
             first(before, after)
             np.tanh(units, units)
@@ -92,7 +93,7 @@ class SplinePoint:
         """Return h^-1(y)."""
         out, sums, bound, last = self._out, self._sums, self._bound, self._n_bins - 1
         n_moved, length = self._n_moved, 2 * self._bound
-        self._states[0, : self._n_dims] = y
+        self._start[:] = (*y, 1.0)
         for (first, before, after, units, shown), second in self._back:
             first(before, after)
             np.tanh(units, units)
@@ -126,7 +127,7 @@ class SplinePoint:
         n_moved, length = self._n_moved, 2 * self._bound
         slopes, turned, tangent = self._slopes, self._turned, self._tangent
         d_units = turned[d:]
-        self._states[0, :d] = z
+        self._start[:] = (*z, 1.0)
         tangent[:] = dz
         for ((first, before, after, units, shown), second), third, fourth in self._tangents:
             first(before, after)
