@@ -122,6 +122,7 @@ def test_the_still_ends_go_and_the_motion_stays(sigma, seed):
     kept, note = trimmed(noisy(whole, sigma, seed))
     assert 0.5 - 0.06 <= kept.times[0] <= 0.5 + lost
     assert 1.5 - lost <= kept.times[-1] <= 1.5 + 0.06
+    assert ("its scatter hides" in note.text) == (sigma > 0.001)
     assert note.values["start"] == np.searchsorted(times, kept.times[0])
     assert note.values["start"] + note.values["end"] + len(kept) == len(times)
 
