@@ -296,6 +296,11 @@ def _short(value: Any) -> str:
 def _registered(name: str) -> type[Method]:
     from iflow_gym.baselines.registry import METHODS, load_method
 
+    if name == "conditional-imitation-flow":
+        raise ValueError(
+            "expected one motion, got a model of several: write the one that you mean by "
+            "ConditionalImitationFlow.load(path).at(context).save(other_path)"
+        )
     if name not in METHODS:
         raise ValueError(
             f"expected a method of the registry ({', '.join(METHODS)}), got {_short(name)}: pass "

@@ -334,6 +334,10 @@ TRAPS = {
     "no method": (raw(head(method=None)), "method to be of type str, got None"),
     "a long method": (raw(head(method="x" * 10**5)), "registry .* got 'xxx.*[.]{3}: pass"),
     "a method that is a module": (raw(head(method="os:system")), "got 'os:system': pass method="),
+    "several motions in one": (
+        raw(head(method="conditional-imitation-flow")),
+        "expected one motion, got a model of several",
+    ),
     "a method that is a path": (raw(head(method="../x")), "got '../x': pass method="),
     "settings in a list": (raw(head(config=[])), r"config to be of type dict, got \[\]"),
     "true dimensions": (raw(head(n_dims=True)), "n_dims to be of type int, got True"),
