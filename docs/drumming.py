@@ -1,9 +1,12 @@
-"""Makes the pictures of docs/drumming.md: `python docs/drumming.py`, two minutes.
+"""Makes the pictures of docs/drumming.md: `python docs/drumming.py`, a minute.
 
 docs/images/drumming.gif          a demonstration replayed by the arm, one round
 docs/images/drumming.png          the demonstrations in space, and when which drum is hit
 docs/images/drumming-learned.gif  ImitationFlow drums, one round after two others
 docs/images/drumming-learned.png  its path among the demonstrations, and when it hits which drum
+docs/images/drumming-in-time.png  when it hits which drum by itself, and when it is given a score
+
+ImitationFlow is the leaderboard's model of seed 0.
 """
 
 from collections.abc import Iterator
@@ -15,8 +18,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from iflow_gym import DynamicalSystem, DynamicalSystemPolicy
+from iflow_gym import DynamicalSystemPolicy
 from iflow_gym.baselines.imitation_flow import ImitationFlow
+from iflow_gym.baselines.imitation_flow.in_time import InTimePolicy, rehearsed
 from iflow_gym.datasets.drums import DRUMS, load_drums
 from iflow_gym.envs.drumming.control import CONTROL_DT
 from iflow_gym.envs.drumming.env import DrummingEnv
@@ -25,6 +29,10 @@ from iflow_gym.metrics.drumming import FORCE_THRESHOLD, rhythm
 from iflow_gym.plotting import DEMONSTRATION, INK, ROLLOUT
 
 IMAGES = Path(__file__).parent / "images"
+MODEL = (
+    Path(__file__).resolve().parents[1]
+    / "leaderboard/results/imitation-flow/Drumming-v0.reproduction.seed0.safetensors"
+)
 SHOWN = 1
 """The demonstration of the moving picture."""
 EVERY = 6
@@ -45,13 +53,12 @@ def replayed(env: DrummingEnv, index: int) -> Iterator[dict]:
         yield info
 
 
-def played(env: DrummingEnv, system: DynamicalSystem, index: int) -> Iterator[dict]:
-    """Let a system drum from a demonstration's start; yield each step's info, and the tip in it."""
-    policy = DynamicalSystemPolicy(system, env)
+def played(env: DrummingEnv, policy: Any, index: int) -> Iterator[dict]:
+    """Let a policy drum from a demonstration's start; yield each step's info, and the tip in it."""
     observation, _ = env.reset(options={"demonstration": index})
-    truncated = False
+    truncated, state = False, None
     while not truncated:
-        action, _ = policy.predict(observation)
+        action, state = policy.predict(observation, state)
         observation, _, _, truncated, info = env.step(action)
         yield info | {"tip": observation}
 
@@ -149,7 +156,7 @@ def still() -> None:
     save_figure(figure, IMAGES / "drumming.png", dpi=110)
 
 
-def learned(system: DynamicalSystem) -> None:
+def learned(system: ImitationFlow) -> None:
     """Draw a system's path among the demonstrations, and its hits in time."""
     n_steps = round(ROUNDS * load_drums().period / CONTROL_DT)
     env = DrummingEnv(horizon=n_steps)
@@ -159,7 +166,7 @@ def learned(system: DynamicalSystem) -> None:
     for path in demos.positions:
         space.plot(*path.T, color=INK, linewidth=0.9, alpha=0.5)
     for index in range(len(demos)):
-        infos = list(played(env, system, index))
+        infos = list(played(env, DynamicalSystemPolicy(system, env), index))
         hits = sorted(hit for info in infos for hit in info["hits"])
         tempo = np.median(np.diff([hit.time for hit in hits if hit.drum == 0]))
         first = next(hit.time for hit in hits if hit.drum == 0)
@@ -183,6 +190,29 @@ def learned(system: DynamicalSystem) -> None:
     save_figure(figure, IMAGES / "drumming-learned.png", dpi=110)
 
 
+def in_time(system: ImitationFlow) -> None:
+    """Draw the hits of a system by itself, and given each demonstration's score."""
+    env = DrummingEnv()
+    phases = rehearsed(system, env)
+    figure = Figure(figsize=(9, 5.2), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    above, below = figure.subplots(2, 1, sharex=True, sharey=True)
+    for index in range(len(env.demonstrations)):
+        notes = env.score_of(index)
+        alone = DynamicalSystemPolicy(system, env)
+        row_of_hits(above, index, notes, list(played(env, alone, index)))
+        given = InTimePolicy(system, [notes], phases, env)
+        row_of_hits(below, index, notes, list(played(env, given, index)))
+    titles = ("by itself, from the start of each demonstration", "given the demonstration's score")
+    for time, title in zip((above, below), titles, strict=True):
+        time.set_title(title, fontsize=10, color=INK)
+        time.set(ylabel="demonstration", yticks=range(1, len(env.demonstrations) + 1))
+        time.spines[["top", "right"]].set_visible(False)
+    below.set(xlabel="time (s); bars are the notes of a demonstration, dots are hits", xlim=(0, 10))
+    below.invert_yaxis()
+    save_figure(figure, IMAGES / "drumming-in-time.png", dpi=110)
+
+
 def main() -> None:
     """Draw all."""
     size = {"render_mode": "rgb_array", "width": 480, "height": 360}
@@ -190,11 +220,13 @@ def main() -> None:
     moving(env, replayed(env, SHOWN), "drumming.gif")
     env.close()
     still()
-    system = ImitationFlow(emission="autoregressive").fit(load_drums(), seed=0)
+    system = ImitationFlow.load(MODEL)
     learned(system)
+    in_time(system)
     turn = round(load_drums().period / CONTROL_DT)
     env = DrummingEnv(horizon=3 * turn + EVERY, **size)
-    moving(env, played(env, system, SHOWN), "drumming-learned.gif", begin=2 * turn)
+    policy = DynamicalSystemPolicy(system, env)
+    moving(env, played(env, policy, SHOWN), "drumming-learned.gif", begin=2 * turn)
     env.close()
 
 

@@ -40,7 +40,7 @@ NEWTON_STEPS = 60
 """At most; two or three are usual."""
 
 NEWTON_TOLERANCE = 1e-8
-"""Of s, and how large the last step may be: it leaves an error of about its own square."""
+"""Of s, and how large the last step may be: Newton's steps from above shrink with their square."""
 
 TINY = float(np.finfo(np.float64).tiny)
 """Keeps a slope or a norm that is 0 from being divided by."""

@@ -36,7 +36,7 @@ from iflow_gym.baselines.imitation_flow.fields.coupling_table import BLOCK, Coup
 from iflow_gym.demonstrations import FloatArray
 
 TABULATED = 128
-"""States from which on tables, which take the time of 100 000 states to make, are faster than units.
+"""States from which on tables are faster than units; they take the time of 100 000 states to make.
 
 With 64 they are as fast. A batch and its states one by one then differ by the tables' error."""
 

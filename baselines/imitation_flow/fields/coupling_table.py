@@ -6,10 +6,11 @@ each function is the quintic that has its value and its first two derivatives at
 (Hermite interpolation, e.g. de Boor, A Practical Guide to Splines, 2001, chapter I), with as many
 cells as bring it within `TOLERANCE` of the functions, and no unit's tanh is taken.
 
-Such layers are a diffeomorphism of their own: their scales are positive, and what divides on the way
-back is what multiplied. A translation, of the size of the error, lets it have 0 where the layers have
-it, so that a goal there is one of the tabulated flow as well. A state that leaves the tables is none
-of theirs; where the layers answer for it, the two meet in a step of the size of the error.
+Such layers are a diffeomorphism of their own: their scales are positive, and what divides on the
+way back is what multiplied. A translation, of the size of the error, lets it have 0 where the
+layers have it, so that a goal there is one of the tabulated flow as well. A state that leaves the
+tables is none of theirs; where the layers answer for it, the two meet in a step of the size of the
+error.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ _QUINTIC = np.array(
 """Coefficients of x^5 to 1 from f(0), f(1), f'(0), f'(1), f''(0), f''(1)."""
 
 _INSIDE = 0.4
-"""Where in a cell the error is taken: beside the middle, where a symmetric function would have none."""
+"""Where in a cell the error is taken: beside the middle, where a symmetric function has none."""
 
 
 def table_of(
