@@ -2,8 +2,8 @@
 
 By itself, and told when its strokes are due (`iflow_gym.baselines.imitation_flow.in_time`), by the
 environment's own metrics, on the tip that the physics moves. With coupling layers, the default, the
-models are the leaderboard's; with autoregressive ones, the paper's for the robot, they are fitted
-here, on the six demonstrations as well.
+models are the leaderboard's; with autoregressive ones, the paper's for the robot, or on the
+authors' recording (`--recorded`), they are fitted here, on all six demonstrations as well.
 
 - *by itself*: from each demonstration's start, eight periods; a hundred starts; pushes.
 - *to the score*: from the same starts, each to its demonstration's score.
@@ -76,18 +76,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument("--emission", choices=["coupling", "autoregressive"], default="coupling")
+    parser.add_argument("--recorded", action="store_true", help="on iflow/DrummingRecorded-v0")
     parser.add_argument("--stability", action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
-    env: Any = gymnasium.make("iflow/Drumming-v0").unwrapped
+    name = "DrummingRecorded-v0" if options.recorded else "Drumming-v0"
+    env: Any = gymnasium.make(f"iflow/{name}").unwrapped
     scores = [env.score_of(index) for index in range(len(env.demonstrations))]
     own = (*ACCURACY, *STABILITY) if options.stability else ACCURACY
     for seed in options.seeds:
-        if options.emission == "coupling":
-            path = RESULTS / f"Drumming-v0.reproduction.seed{seed}.safetensors"
-            model = ImitationFlow.load(path)
+        if options.emission == "coupling" and not options.recorded:
+            model = ImitationFlow.load(RESULTS / f"{name}.reproduction.seed{seed}.safetensors")
         else:
             model = ImitationFlow(emission=options.emission).fit(env.demonstrations, seed=seed)
-        label = f"{options.emission}, seed {seed}"
+        label = f"{name}, {options.emission}, seed {seed}"
         found = evaluate(model, env, seed=seed, stability=options.stability).metrics
         print(f"{label}, by itself: {table(found, own)}", flush=True)
         try:

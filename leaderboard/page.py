@@ -248,11 +248,7 @@ def warnings_about(results: Sequence[Result]) -> list[str]:
         used = sorted({r.versions[library] for r in results if library in r.versions})
         if len(used) > 1:
             found.append(f"The records were made with different versions of {library}: {used}.")
-    if len(presets := sorted({r.preset for r in results})) > 1:
-        found.append(
-            f"The records are of different presets: {', '.join(presets)}. A preset is how many "
-            "seeds were run and with which settings; *Cells* and each method's details say it."
-        )
+    found += _mixed_presets(results)
     n_smoke = sum(r.preset == "smoke" for r in results)
     if n_smoke == len(results) > 0:
         found.append(f"This is a trial: all its records are of {SMOKE}")
@@ -261,6 +257,26 @@ def warnings_about(results: Sequence[Result]) -> list[str]:
     if len({str(r.hardware.get("cpu")) for r in results}) > 1:
         found.append("The records were made on different processors: costs do not compare.")
     return found
+
+
+def _mixed_presets(results: Sequence[Result]) -> list[str]:
+    """Say which methods have other settings in one preset than in another, if any.
+
+    Where they have the same in all, a preset is no more than how many seeds were run.
+    """
+    settings: dict[tuple[str, str], dict[str, set[str]]] = {}
+    for r in results:
+        per_preset = settings.setdefault((escaped(r.title), r.family), {})
+        per_preset.setdefault(r.preset, set()).add(r.hashes.get("config", "none"))
+    found: dict[str, set[str]] = {}
+    for (title, _), per_preset in settings.items():
+        if len(set.union(*per_preset.values())) > 1 and len(per_preset) > 1:
+            found.setdefault(title, set()).update(per_preset)
+    return [
+        f"The records of {title} are of presets with different settings: "
+        f"{', '.join(sorted(presets))}; its details say which."
+        for title, presets in sorted(found.items())
+    ]
 
 
 def _mixed_rows(results: Sequence[Result]) -> list[str]:
