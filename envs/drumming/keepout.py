@@ -8,9 +8,11 @@ sphere, so the cylinder is wider than the drum by its radius.
 
 With r the horizontal distance from the drum's axis, outside means above the face, r <= R and
 z >= f, or beside the wall, r >= R. Below the face and within the wall, the nearer of the two leads
-out. Where a wall takes off of a command, the tip rises at least as fast as was taken off, up to
-`CLIMB`: over a drum the way is free, and a command that leads into a wall and down it, or into the
-wedge between a wall and the border of the workspace, would come to rest there for ever.
+out. Beside the wall r is that of the stick, which lies behind the tip and rises: of its point
+nearest to the axis among those below the face. Its orientation is held, so that all of it moves as
+the tip does. Where a wall takes off of a command, the tip rises at least as fast as was taken off,
+up to `CLIMB`: over a drum the way is free, and a command that leads into a wall and down it, or
+into the wedge between a wall and the border of the workspace, would come to rest there for ever.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import numpy as np
 
 from iflow_gym.datasets.drums import TIP_RADIUS, Drum
 from iflow_gym.demonstrations import FloatArray
+from iflow_gym.envs.drumming.scene import STICK_BACK, STICK_FRONT, STICK_PITCH
 
 FOLLOW_THROUGH: Final = 0.016
 """How far a command may lead into a head, in m; the demonstrations' strokes end 11 to 14 mm in."""
@@ -33,6 +36,12 @@ slowed before it meets the head."""
 
 CLIMB: Final = 0.1
 """Speed in m/s up to which a tip that is led into a wall rises."""
+
+REACH: Final = float((STICK_FRONT + STICK_BACK) * np.cos(STICK_PITCH))
+"""Horizontal length of the stick behind the tip, along -x, in m."""
+
+RISE: Final = float(np.tan(STICK_PITCH))
+"""By how much the stick is higher, a metre behind the tip."""
 
 RIM: Final = 0.007
 """How much wider than its head a drum is, in m."""
@@ -60,6 +69,10 @@ class KeepOut:
                 if velocity[2] < least:
                     velocity = np.array([velocity[0], velocity[1], least])
             elif above < 0.0:
+                # The stick's nearest point below the face is where it touches.
+                across -= min(max(across, 0.0), REACH, -above / RISE)
+                r = hypot(across, along)
+                beside = r - wall
                 # On the axis every way out is as short.
                 out = np.array([across / r, along / r, 0.0] if r else [1.0, 0.0, 0.0])
                 least, towards = -beside / BRAKING_TIME, float(out @ velocity)

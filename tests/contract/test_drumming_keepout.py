@@ -9,7 +9,15 @@ from hypothesis import strategies as st
 
 from iflow_gym.datasets.drums import DRUMS, LEFT, RIGHT, TIP_RADIUS
 from iflow_gym.envs.drumming.env import DrummingEnv
-from iflow_gym.envs.drumming.keepout import BRAKING_TIME, CLIMB, FOLLOW_THROUGH, RIM, KeepOut
+from iflow_gym.envs.drumming.keepout import (
+    BRAKING_TIME,
+    CLIMB,
+    FOLLOW_THROUGH,
+    REACH,
+    RIM,
+    RISE,
+    KeepOut,
+)
 
 FACE = RIGHT.head[2] + TIP_RADIUS - FOLLOW_THROUGH
 WALL = RIGHT.radius + RIM + TIP_RADIUS
@@ -47,6 +55,19 @@ def test_into_a_wall_a_command_slides_along_it_and_up():
     np.testing.assert_array_equal(keep.slid(beside, away), away)
 
 
+def test_the_stick_behind_the_tip_slides_along_a_wall_as_the_tip_does():
+    """It lies along x: beside the drum it touches where the drum is widest."""
+    keep = KeepOut((RIGHT,))
+    ahead = np.array([RIGHT.head[0] + 0.1, RIGHT.head[1] - WALL, 0.15])
+    assert depth(ahead) < -0.02  # the tip alone is far off
+    slid = keep.slid(ahead, np.array([-0.05, 0.28, -0.14]))
+    np.testing.assert_allclose(slid, [-0.05, 0.0, CLIMB], atol=1e-12)
+    # Where the stick is above the face it is over the head, and may come down on it.
+    over = ahead + np.array([0.0, 0.0, FACE - ahead[2] - 0.02 * RISE])
+    free = np.array([0.0, 0.2, 0.0])
+    np.testing.assert_array_equal(keep.slid(over, free), free)
+
+
 def test_deep_inside_a_command_leads_out_the_nearer_way():
     keep = KeepOut((RIGHT,))
     pressed = keep.slid(OVER - np.array([0.0, 0.0, 0.003]), np.array([0.1, 0.0, -0.2]))
@@ -72,17 +93,19 @@ def test_no_command_leads_deeper_in_than_the_distance_allows(point, velocity):
 @given(point=vector, velocity=vector)
 def test_nothing_but_a_climb_is_added_to_a_command_outside(point, velocity):
     point = point + RIGHT.head
-    if depth(point) <= 0:
+    if max(depth_of_stick(RIGHT, point), depth_of_stick(LEFT, point)) <= 0:
         slid = KeepOut(DRUMS).slid(point, velocity)
-        if depth_of(LEFT, point) <= 0:
-            assert np.linalg.norm(slid[:2]) <= np.linalg.norm(velocity[:2]) + 1e-12
-            assert slid[2] >= velocity[2]
-            assert slid[2] <= max(velocity[2], CLIMB) + 1e-12
+        assert np.linalg.norm(slid[:2]) <= np.linalg.norm(velocity[:2]) + 1e-12
+        assert slid[2] >= velocity[2]
+        assert slid[2] <= max(velocity[2], CLIMB) + 1e-12
 
 
-def depth_of(drum, point):
-    r = np.hypot(*(point[:2] - drum.head[:2]))
-    return min(FACE - point[2], drum.radius + RIM + TIP_RADIUS - r)
+def depth_of_stick(drum, point):
+    """How deep the stick is in a drum's solid, where it is deepest beside the wall."""
+    behind = np.linspace(0.0, REACH, 4000)[:, None] * [-1.0, 0.0, RISE]
+    stick = point + behind
+    r = np.hypot(*(stick[:, :2] - drum.head[:2]).T)
+    return np.minimum(FACE - stick[:, 2], drum.radius + RIM + TIP_RADIUS - r).max() + 1e-4
 
 
 def test_an_arm_that_is_led_through_a_head_slides_off_it():
@@ -97,6 +120,18 @@ def test_an_arm_that_is_led_through_a_head_slides_off_it():
     over = np.hypot(*(observation[:2] - RIGHT.head[:2])) < RIGHT.radius
     assert not over
     assert depths[60] < 0.004  # of a tip that is over the head all the while
+
+
+def test_a_stick_that_is_led_into_a_wall_and_down_it_climbs_over():
+    """The tip in front of the drum, in the open; the stick behind it at the wall."""
+    env = DrummingEnv(horizon=400)
+    observation, _ = env.reset(options={"start": [0.784, -0.29, 0.15]})
+    for _ in range(300):
+        velocity = np.array([0.0, 0.28, -0.14])
+        observation, *_ = env.step(env.command_to_action(velocity, observation))
+        if observation[1] > RIGHT.head[1]:
+            break
+    assert observation[1] > RIGHT.head[1]
 
 
 def test_a_tip_that_is_led_into_a_wall_and_down_it_climbs_over():
