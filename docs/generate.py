@@ -1,10 +1,8 @@
 """Writes the pages that are made of code: `python docs/generate.py`.
 
 docs/environments.md and a page for each family of environments from their docstrings,
-docs/metrics.md from the registry of metrics, the tables of results in the README and on the page of
-residuals from the committed
-records. A test compares the pages with
-what this would write.
+docs/metrics.md from the registry of metrics, the tables in the README and on the pages of drumming
+and of residuals from the committed records. A test compares the pages with what this would write.
 """
 
 import inspect
@@ -249,99 +247,13 @@ def family_page(family: Family) -> str:
 
 
 def drumming() -> str:
-    """Return the page of the drumming arm."""
+    """Return the page of the drumming arm with its tables filled in."""
     rows = "\n".join(
         f"| `{m.name}` | {m.definition} |" for m in METRICS if m.motions == ("drumming",)
     )
-    return f"""# Drumming
-
-[`{DRUMMING_ID}`](environments/drumming.md) and
-[`{DRUMMING_RECORDED_ID}`](environments/drumming-recorded.md): an arm with a stick, and two drums.
-
-![The arm plays one round](images/drumming.gif)
-
-*A demonstration replayed: over a high arch to the right drum, over a low one to the left. A head
-that is hit turns yellow; the blue line is the tip's way in the last 0.6 s.*
-
-```python
-import gymnasium as gym
-
-import iflow_gym
-
-env = gym.make("{DRUMMING_ID}")
-demonstrations = env.unwrapped.demonstrations  # six, 10 s each, at 100 Hz
-path = demonstrations.positions[0]
-
-observation, info = env.reset(options={{"demonstration": 0}})
-for following in path[1:]:
-    velocity = (following - observation) / info["dt"]
-    action = env.unwrapped.command_to_action(velocity, observation)
-    observation, reward, terminated, truncated, info = env.step(action)
-    for hit in info["hits"]:
-        print(f"{{hit.time:.2f}} s: {{env.unwrapped.drums[hit.drum].name}}, {{hit.force:.0f}} N")
-```
-
-![The demonstrations in space, and when which drum is hit](images/drumming.png)
-
-## What the scores mean
-A demonstration implies a score: where the bead of its stick comes down to a head is a note. Its
-replay by the arm hits every note within 1 ms. `env.unwrapped.score(system, seed=0)` rolls a policy
-out from each demonstration's start for eight periods, on the tip that the physics moves. The hits
-of as long as the demonstration lasts are compared with its score, those of the whole with the
-rhythm that the demonstrations have in common; beside them stand the metrics of
-[cycles](metrics.md#accuracy):
-
-| name | what it is |
-| --- | --- |
-{rows}
-
-`hit_f1` is strict: rounds last a few per cent more or less, so one demonstration played against
-another one's score gets 0.18 on average, and 0.68 at the best shift in time. A policy without a
-clock cannot know which of them it is to follow; `rhythm_f1` and `tempo_error` say whether it
-drums. `timing_error` is infinite where from one of the starts no note is matched.
-
-## What is learned so far
-![ImitationFlow drums](images/drumming-learned.gif)
-
-*ImitationFlow's third round, with autoregressive layers: its field is what moves the arm.*
-
-![Its path among the demonstrations, and when it hits which drum](images/drumming-learned.png)
-
-ImitationFlow with its default settings (coupling layers), seeds 0, 1 and 2, fitted on the six
-demonstrations and scored on them (`env.unwrapped.score(system, seed=0)`); from the leaderboard's
-records:
-
-{_drumming_scores()}
-
-They drum, at their own tempo: each hit within 50 ms of a rhythm that is shifted to match best, so
-that the two drums may be up to 100 ms off each other. What is not reached: `hit_f1`, in absolute
-time, stays far below one, since the start of a recording says nothing of its tempo, and the first
-hit comes up to 0.2 s off.
-
-Every start that was looked at comes to the orbit in the closed form; in the scene there are drums
-and borders in the way, which the field does not know. Two things bring the arm round all the same.
-The controller slides the stick along a drum, and up at its wall, in place of pressing it into it
-(`iflow_gym.envs.drumming.keepout`); and training asks the field not to lead away from the
-recordings (`inward_weight`). Before, 0.83 to 0.99 of the starts came back; seeds, and the rounding
-of a training, still scatter by a tenth. At the few that do not the field holds the stick against
-the border of the workspace beside a drum.
-
-With autoregressive layers, the paper's for the robot, rhythm and sequence were as good before the
-drums were slid along (0.99 to 1.00), and attraction varied more from seed to seed (0.32 to 0.96);
-they have not been scored since.
-
-The orbit field hits the drums in their order and at the right tempo, but the left one too late in
-the round: where way down and way up lie side by side the nearest point of the orbit leaps.
-
-## Pictures
-`render_mode="rgb_array"` needs OpenGL, everything else does not. Without a display, EGL (Debian's
-libegl1) or OSMesa (libosmesa6) does; `MUJOCO_GL=egl` or `MUJOCO_GL=osmesa` chooses, to be set
-before Python starts. Where it is not set, EGL is taken if it is there, else OSMesa.
-
-## Licences
-The arm's model and meshes are read from gymnasium-robotics, where they are under the Apache
-licence. The recordings are the ImitationFlow authors', under the MIT licence.
-"""
+    of_metrics = f"| name | what it is |\n| --- | --- |\n{rows}"
+    text = (DOCS / "drumming.md").read_text()
+    return filled(filled(text, "metrics", of_metrics), "results", _drumming_scores())
 
 
 def _cell(text: str) -> str:
@@ -451,10 +363,14 @@ def results() -> str:
 
 def readme() -> str:
     """Return the README with its table of results filled in."""
-    path = DOCS.parent / "README.md"
-    head, rest = path.read_text().split("<!-- results -->")
-    _, tail = rest.split("<!-- /results -->")
-    return f"{head}<!-- results -->\n{results()}\n<!-- /results -->{tail}"
+    return filled((DOCS.parent / "README.md").read_text(), "results", results())
+
+
+def filled(page: str, name: str, text: str) -> str:
+    """Return a page with a text between `<!-- name -->` and `<!-- /name -->`."""
+    head, rest = page.split(f"<!-- {name} -->")
+    _, tail = rest.split(f"<!-- /{name} -->")
+    return f"{head}<!-- {name} -->\n{text}\n<!-- /{name} -->{tail}"
 
 
 RESIDUALS = ("imitation-flow", "imitation-flow+residual", "imitation-flow+stable-residual", "ppo")
@@ -551,9 +467,6 @@ def with_interval(numbers: np.ndarray[Any, Any]) -> str:
 
 def residual() -> str:
     """Return the page of residuals with its tables of results filled in."""
-    path = DOCS / "residual.md"
-    head, rest = path.read_text().split("<!-- results -->")
-    _, tail = rest.split("<!-- /results -->")
     records = read_results(DOCS.parent / "leaderboard" / "results")
     rewarded = [r for r in records if r.method in RESIDUALS and r.ok and r.returns]
     text = ""
@@ -561,7 +474,7 @@ def residual() -> str:
         here = [r for r in rewarded if r.environment == environment]
         columns = OF_DRUMMING if "Drumming" in environment else OF_THE_PLANT
         text += f"**`{environment}`**\n\n{residual_table(here, columns)}\n\n"
-    return f"{head}<!-- results -->\n{text.strip()}\n<!-- /results -->{tail}"
+    return filled((DOCS / "residual.md").read_text(), "results", text.strip())
 
 
 PAGES = {
