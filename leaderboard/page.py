@@ -280,19 +280,20 @@ def _mixed_presets(results: Sequence[Result]) -> list[str]:
 
 
 def _mixed_rows(results: Sequence[Result]) -> list[str]:
-    """Say which methods' records were made by different code, or a row's by other settings.
+    """Say which methods' rows are of different code, or of different settings in one preset.
 
-    A row is of one family: a preset of residuals is chosen for each.
+    A row is of one family and one protocol: that another row is of other code mixes nothing.
     """
     groups: dict[tuple[str, str, str], Counter[str]] = {}
     for r in results:
-        for label, where in (("code", ""), ("config", f"{r.preset} on {r.family}")):
+        row = f"{r.family}, {r.protocol}"
+        for label, where in (("code", row), ("config", f"{r.preset} on {row}")):
             key = (escaped(r.title), label, where)
             groups.setdefault(key, Counter())[r.hashes.get(label, "none")] += 1
-    what = {"code": "versions of its code", "config": "settings in the preset"}
+    what = {"code": "versions of its code on", "config": "settings in the preset"}
     return [
-        f"The records of {title} were made with different {f'{what[label]} {where}'.rstrip()}: "
-        f"{_counted(counts)}. Its rows mix them until `python baselines/run_all.py` is run again."
+        f"The records of {title} were made with different {what[label]} {where}: "
+        f"{_counted(counts)}. That row mixes them until all of it is run again."
         for (title, label, where), counts in sorted(groups.items())
         if len(counts) > 1
     ]
@@ -703,7 +704,8 @@ def _versions(results: Sequence[Result]) -> list[str]:
     used: dict[str, set[str]] = {}
     for result in results:
         for name, version in result.versions.items():
-            used.setdefault(name, set()).add(version)
+            # A distribution's name and its module's are the same one's.
+            used.setdefault(name.replace("_", "-"), set()).add(version)
     return [f"{name} {'/'.join(sorted(used[name]))}" for name in sorted(used)]
 
 

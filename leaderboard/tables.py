@@ -208,7 +208,8 @@ def entries_of(board: Board, found: Aggregates, metric: str, statistic: str) -> 
         for row in board.rows
         if (aggregate := found[row.method, metric]) is not None
     }
-    best = {shown(metric, values[name]) for name in board.best(values, metric)}
+    # Where all have run away, none is the best.
+    best = {shown(metric, values[name]) for name in board.best(values, metric)} - {"∞"}
     eligible = eligible_methods(board)
     entries = {}
     for row in board.rows:

@@ -401,12 +401,15 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
         return []
     first = order[0]
     entry = entries[first.method]
+    level = [row for row in order if entries[row.method].text == entry.text]
     text = f"{title} {entry.text} {bracket}".rstrip()
     if entry.interval:
         text += f" ({entry.interval})"
     text += f", over {first.coverage} cells"
     beside = ""
-    if len(order) > 1:
+    if len(level) > 1:
+        text = f"Level, with {text[0].lower()}{text[1:]}"
+    elif len(order) > 1:
         second = order[1]
         beside = f"Next: {second.title}, {entries[second.method].text} {bracket}".rstrip()
         chance = improvements(board).get((first.method, second.method))
@@ -424,7 +427,12 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
         beside += f" Best mean rank over all metrics of accuracy: {titles}."
     beside = beside.strip()
     result = [
-        {"label": "Most accurate", "value": first.title, "text": text, "beside": beside},
+        {
+            "label": "Most accurate",
+            "value": ", ".join(row.title for row in level),
+            "text": text,
+            "beside": beside,
+        },
         proved_card(board, found),
     ]
     fit, step = found[first.method, "fit_cpu_seconds"], found[first.method, "step_us"]

@@ -440,8 +440,8 @@ def test_records_that_compare_are_not_warned_of(builder):
 @pytest.mark.parametrize(
     ("label", "preset", "message"),
     [
-        ("code", "standard", "records of Good were made with different versions of its code: "),
-        ("code", "full", "records of Good were made with different versions of its code: "),
+        ("code", "standard", "Good were made with different versions of its code on LASA-26, repr"),
+        ("code", "full", "Good were made with different versions of its code on LASA-26, repr"),
         (
             "config",
             "standard",
@@ -466,9 +466,10 @@ def test_records_of_a_method_that_do_not_compare_are_warned_of(builder, label, p
         assert "23 cells by none, 3 cells by new" in text
 
 
-def test_each_family_may_have_settings_of_its_own(builder):
+def test_each_family_may_have_settings_and_code_of_its_own(builder):
     own = record("good", MULTI_MODELS[0])
-    other = record("good", MULTI_MODELS[0], hashes={**own.hashes, "config": "new"})
+    new = {"config": "new", "code": "new"}
+    other = record("good", MULTI_MODELS[0], hashes={**own.hashes, **new})
     text = render(builder, [*sweep("good"), other])
     assert "records of Good were made" not in text
 

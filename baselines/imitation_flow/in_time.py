@@ -7,9 +7,10 @@ constant rate b, whatever the flow has bent the circle into. `InTimePolicy` step
     s dt,    s = (d psi* / dt + g (psi* - psi)) / b,    s_min <= s <= s_max,
 
 in place of dt, with psi*(t) the phase that is due: a monotone curve (PCHIP) through the phases of
-the notes at their times. As s_min > 0, time alone is bent. Every state lies on the orbit that the
-model itself has through the state before, so that what is proved of its orbits - that they come to
-the cycle, and how V decreases along them - holds of them at any pace, s_min b at least.
+the notes at their times, each the next of its kind after the note before. As s_min > 0, time alone
+is bent. Every state lies on the orbit that the model itself has through the state before, so that
+what is proved of its orbits - that they come to the cycle, and how V decreases along them - holds
+of them at any pace, s_min b at least.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from iflow_gym.policy import DynamicalSystemPolicy
 
 TURN = 2 * np.pi
 
-SLOWEST, FASTEST = 0.5, 1.6
+SLOWEST, FASTEST = 0.1, 1.6
 """s_min and s_max: how much slower and faster than the model goes by itself."""
 
 GAIN = 3.0
@@ -43,8 +44,12 @@ Score = tuple[ArrayLike, ArrayLike]
 class InTimePolicy:
     """Plays scores on a model's cycle (see the module).
 
-    Its state is its clock: give the one that `predict` returns back to the next call. After the
-    last note it goes on at the model's own pace.
+    Notes that come too fast are played one after another, late. What lies on the way from one note
+    to the next is passed through, asked for or not; after the last one the model goes on at its
+    own pace.
+
+    Its state is its clock and how far it has turned: give the one that `predict` returns back to
+    the next call.
 
     Parameters
     ----------
@@ -139,21 +144,26 @@ class InTimePolicy:
         x = np.atleast_2d(values[..., : self._policy.n_dims])
         psi = latent_phase(self.model, x)
         dt = np.broadcast_to(np.asarray(self._policy.dt, dtype=np.float64), len(x))
+        psi = np.sign(self._rate) * latent_phase(self.model, x)
+        dt = np.broadcast_to(np.asarray(self._policy.dt, dtype=np.float64), len(x))
         if state is None:
             begun = np.ones(len(x), dtype=np.bool_)
-            state = {"time": np.zeros(len(x)), "due": [None] * len(x)}
+            state = {"time": np.zeros(len(x)), "turned": psi, "due": [None] * len(x)}
         else:
             begun = np.zeros(len(x), dtype=np.bool_)
             if episode_start is not None:
                 begun |= np.asarray(episode_start, dtype=np.bool_).reshape(-1)
         time = np.where(begun, 0.0, state["time"])
+        # Whole turns count: who is a turn behind has its notes still to play.
+        on = (psi - state["turned"] + np.pi) % TURN - np.pi
+        turned = np.where(begun, psi, state["turned"] + on)
         due = [
             self._due(self._of_row(i, len(x)), psi[i]) if begun[i] else state["due"][i]
             for i in range(len(x))
         ]
-        pace = np.array([self._pace(*row) for row in zip(due, time, psi, dt, strict=True)])
+        pace = np.array([self._pace(*row) for row in zip(due, time, turned, dt, strict=True)])
         action = self._policy.paced(values, pace.reshape(values.shape[:-1]))
-        return action, {"time": time + dt, "due": due}
+        return action, {"time": time + dt, "turned": turned, "due": due}
 
     def _of_row(self, row: int, n_rows: int) -> list[tuple[float, int]]:
         if len(self._notes) == 1:
@@ -166,32 +176,26 @@ class InTimePolicy:
         return self._notes[row]
 
     def _due(self, score: list[tuple[float, int]], start: float) -> PchipInterpolator:
-        """Return psi*(t), which begins at a state's own phase; it grows where b is negative too."""
+        """Return psi*(t), which begins at a state's own phase; turned so that it grows."""
         sign, rate = np.sign(self._rate), abs(self._rate)
-        times, due = [0.0], [sign * start]
+        times, due = [0.0], [start]
         for time, note in score:
-            expected = due[-1] + rate * (time - times[-1])
-            phase = sign * self.phases[note]
-            phase += TURN * np.round((expected - phase) / TURN)
-            if time <= times[-1]:  # a note at the very start is played from where one is
+            if time == 0.0:  # played from where one is
                 continue
-            if phase <= due[-1]:
-                phase += TURN
             times.append(time)
-            due.append(phase)
+            due.append(due[-1] + (TURN - (due[-1] - sign * self.phases[note]) % TURN))
         # As far again at the model's own pace, which gives the curve's end its slope.
         times.append(times[-1] + TURN / rate)
         due.append(due[-1] + TURN)
         return PchipInterpolator(times, due)
 
-    def _pace(self, due: PchipInterpolator, time: float, psi: float, dt: float) -> float:
-        """Return s of a step that begins at a time with a phase."""
-        sign, rate = np.sign(self._rate), abs(self._rate)
+    def _pace(self, due: PchipInterpolator, time: float, turned: float, dt: float) -> float:
+        """Return s of a step that begins at a time, with a phase that has grown since the start."""
+        rate = abs(self._rate)
         if time + dt > due.x[-2]:
             return 1.0
         wanted, following = due(time), due(time + dt)
-        behind = (wanted - sign * psi + np.pi) % TURN - np.pi
-        pace = ((following - wanted) / dt + self.gain * behind) / rate
+        pace = ((following - wanted) / dt + self.gain * (wanted - turned)) / rate
         return float(np.clip(pace, self.slowest, self.fastest))
 
     def _checked(self, score: Score, index: int) -> list[tuple[float, int]]:

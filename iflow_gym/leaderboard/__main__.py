@@ -18,7 +18,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import Counter
 from pathlib import Path
+from typing import get_args
 
 from tyro.conf import Positional
 
@@ -47,6 +49,7 @@ def check(
     from rich.markup import escape
     from rich.table import Table
 
+    from iflow_gym.leaderboard.check import Verdict
     from iflow_gym.leaderboard.check import check as check_folder
 
     console = Console(width=None if sys.stdout.isatty() else 140)
@@ -61,6 +64,9 @@ def check(
             for finding in report.findings:
                 table.add_row(escape(finding.what), finding.verdict, escape(_plain(finding.text)))
             console.print(table)
+            counts = Counter(finding.verdict for finding in report.findings)
+            said = ", ".join(f"{counts[v]} {v}" for v in get_args(Verdict) if counts[v])
+            console.print(f"{folder}: {said}.", highlight=False, markup=False)
             status = 1 if 1 in (status, report.status) else max(status, report.status)
     except (OSError, ValueError) as error:
         print(f"iflow_gym.leaderboard: {error}", file=sys.stderr)

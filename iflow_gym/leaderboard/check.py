@@ -31,6 +31,9 @@ N_CELLS = 3
 N_SUSPECTS = 3
 """Cells beyond these whose own records speak against a proof: each is scored again, too."""
 
+STATES_SHOWN = 2
+"""States of a cell that contradict a proof and are told, with where each leads."""
+
 MOST_SHOWN = 5
 """Differences of one cell that are told one by one."""
 
@@ -190,7 +193,8 @@ def _check_again(report: Report, records: list[Result], n_cells: int, *, trust: 
 
 def _speaks_against_itself(result: Result) -> bool:
     names = ("diverged", "spurious_attractors", "lyapunov_violation")
-    return _proved(result) and any(result.metrics.get(name) for name in names)
+    seen = any(result.metrics.get(name) for name in names)
+    return _proved(result) and (seen or result.metrics.get("converged") == 0)
 
 
 def _proved(result: Result) -> bool:
@@ -224,11 +228,15 @@ def _again(result: Result, folder: Path) -> Iterator[Finding]:
         elif system.guarantee != said:
             yield Finding(what, "note", "its class gives another reason for its guarantee by now")
         if "proved" in (system.guarantee.kind, getattr(result.guarantee, "kind", None)):
-            for against in examine(system, result.environment, result.seed, found.metrics):
-                if isinstance(against, Contradiction):
-                    yield Finding(what, "refused", f"claimed proved, but it {against}")
-                else:
-                    yield Finding(what, "note", str(against))
+            against = list(examine(system, result.environment, result.seed, found.metrics))
+            proofs = [str(each) for each in against if isinstance(each, Contradiction)]
+            for text in proofs[:STATES_SHOWN]:
+                yield Finding(what, "refused", f"claimed proved, but it {text}")
+            if len(proofs) > STATES_SHOWN:
+                yield Finding(what, "refused", f"and from {len(proofs) - STATES_SHOWN} more states")
+            for each in against:
+                if not isinstance(each, Contradiction):
+                    yield Finding(what, "note", str(each))
     except UnknownNameError as error:
         yield Finding(what, "unchecked", str(error))
     except Exception as error:

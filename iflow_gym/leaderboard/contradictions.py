@@ -16,6 +16,8 @@ the suspects; each is followed by the method's own rollout, for longer:
   is above rounding. One that only stays equal, to rounding, does not.
 
 That not all starts have converged within the horizon contradicts nothing: a proof promises no pace.
+Those that had not arrived are followed for ten horizons; that some came no nearer in the last
+quarter of them, as what goes round does, is noted. It is no contradiction: no finite time is one.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iflow_gym import metrics
 from iflow_gym.baselines.runner.plan import task_of
@@ -98,7 +101,9 @@ def examine(
     task = task_of(environment)
     attraction = found.get("attraction")
     elsewhere = attraction is not None and attraction < 1
-    if found.get("diverged") or found.get("spurious_attractors") or elsewhere:
+    converged = found.get("converged")
+    away = converged is not None and converged < 1
+    if found.get("diverged") or found.get("spurious_attractors") or elsewhere or away:
         yield from _moved(system, task)
     if found.get("lyapunov_violation") and isinstance(system, DynamicalSystem):
         yield from _risen(system, task, seed)
@@ -123,6 +128,10 @@ def _moved(system: Method, task: Any) -> Iterator[Contradiction | Suspicion]:
         still &= np.linalg.norm(ends - demos.attractor, axis=1) > tolerance
     if still.any():
         yield from _followed_on(system, starts[still], ends[still], n_steps, dt, task)
+    if demos.goal is not None:
+        under_way = ~gone & ~still & (np.linalg.norm(ends - demos.attractor, axis=1) > tolerance)
+        if under_way.any():
+            yield from _followed_round(system, starts[under_way], n_steps, dt, demos.attractor)
 
 
 def _grid(task: Any) -> tuple[FloatArray, int, float]:
@@ -168,7 +177,7 @@ def _followed_on(
     demos = task.demonstrations
     box = scored_box(demos)
     diagonal = metrics.box_diagonal(*box)
-    chosen = np.unique(np.linspace(0, len(ends) - 1, min(FOLLOWED, len(ends))).astype(int))
+    chosen = _some(len(ends))
     begun, at = starts[chosen], ends[chosen]
     n = REST_HORIZONS * n_steps
     if isinstance(system, DynamicalSystem):
@@ -193,6 +202,30 @@ def _followed_on(
             f"of {len(at)} that were followed for {n * dt:.3g} s more, {there.sum()} are at the "
             f"goal, {(moving & ~there).sum()} on their way"
         )
+
+
+def _followed_round(
+    system: Method, starts: FloatArray, n_steps: int, dt: float, goal: FloatArray
+) -> Iterator[Suspicion]:
+    followed = starts[_some(len(starts))]
+    n = REST_HORIZONS * n_steps
+    with np.errstate(all="ignore"):
+        paths = system.rollout(followed, n, dt)  # type: ignore[attr-defined]
+    away = np.linalg.norm(paths - goal, axis=2)
+    third, fourth = away[:, n // 2 : 3 * n // 4], away[:, 3 * n // 4 :]
+    no_nearer = ~(fourth.max(axis=1) < third.max(axis=1))
+    if no_nearer.any():
+        yield Suspicion(
+            f"of {len(starts)} starts from which it does not arrive in the environment "
+            f"{len(followed)} were followed for {n * dt:.3g} s: {no_nearer.sum()} came no nearer "
+            f"to the goal in the last quarter, as from {_point(followed[no_nearer][0])}; does it "
+            "go round?"
+        )
+
+
+def _some(count: int) -> NDArray[np.intp]:
+    """Return indices of up to `FOLLOWED` out of so many, evenly taken."""
+    return np.unique(np.linspace(0, count - 1, min(FOLLOWED, count)).astype(np.intp))
 
 
 def _risen(system: DynamicalSystem, task: Any, seed: int) -> Iterator[Contradiction | Suspicion]:
