@@ -370,7 +370,8 @@ def render(
         + ", ".join(f"*{m.title.lower()}*" for m in METRICS if m.better == "higher")
         + " and *classification*. **Bold** is the best value among the "
         "competitors; rows in *italics* are references and do not compete: *nearest demonstration* "
-        "is how far the recordings are from each other, *replay* plays the recording back. Rows "
+        "is how far the recordings are from each other, *replay* plays the recording back, once: "
+        "on the arm two rounds of the eight in which a rhythm is heard. Rows "
         "marked *uses time* follow a clock that was started with the motion: they are no field, so "
         "that what is asked of a field is – there, and are no competitors either.",
         "",
