@@ -9,7 +9,7 @@ from typing import get_args
 from board import MAIN, RANKED, Board, Row, common_ground, motion_of
 from classes import confusion, fraction_right
 from comparisons import compared, improvements, rank_comparison, ranked
-from records import origin, unscored
+from records import origin, unscored, versions_of
 from tables import (
     BY_MEAN,
     Aggregates,
@@ -626,7 +626,7 @@ def about(
         + ", ".join(f"`{h[:16]}`" for h in sorted({r.hashes.get("metrics", "") for r in results}))
         + ", over the code that computes them.",
         "- **Hardware**: " + "; ".join(_hardware(results)) + ".",
-        "- **Versions**: " + ", ".join(_versions(results)) + ".",
+        "- **Versions**: " + versions_of(results) + ".",
         "",
         "To make these numbers again:",
         "",
@@ -699,15 +699,6 @@ def _hardware(results: Sequence[Result]) -> list[str]:
             for h in (result.hardware for result in results)
         }
     )
-
-
-def _versions(results: Sequence[Result]) -> list[str]:
-    used: dict[str, set[str]] = {}
-    for result in results:
-        for name, version in result.versions.items():
-            # A distribution's name and its module's are the same one's.
-            used.setdefault(name.replace("_", "-"), set()).add(version)
-    return [f"{name} {'/'.join(sorted(used[name]))}" for name in sorted(used)]
 
 
 def _commands(results: Sequence[Result]) -> list[str]:

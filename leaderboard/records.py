@@ -245,7 +245,7 @@ def versions_of(cells: Iterable[Result]) -> str:
     used: dict[str, set[str]] = defaultdict(set)
     for cell in cells:
         for name, version in cell.versions.items():
-            used[name].add(version)
+            used[name.replace("_", "-")].add(version)  # a module is of its distribution
     return ", ".join(f"{name} {'/'.join(sorted(used[name]))}" for name in sorted(used))
 
 
