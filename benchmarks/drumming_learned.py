@@ -40,10 +40,10 @@ STABILITY = ("attraction", "diverged", "perturbation_recovery")
 
 def beat(times: Any, notes: Any, pace: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the first round of a score again and again, faster by a factor."""
-    first, second = np.flatnonzero(notes == notes[0])[:2]
-    shifts = (times[second] - times[first]) * np.arange(BEATS // (second - first))
-    due = (times[first:second] + shifts[:, None]).ravel() - times[first]
-    return times[first] + due / pace, np.tile(notes[first:second], len(shifts))
+    second = np.flatnonzero(notes == notes[0])[1]
+    shifts = (times[second] - times[0]) * np.arange(BEATS // second)
+    due = (times[:second] + shifts[:, None]).ravel() - times[0]
+    return times[0] + due / pace, np.tile(notes[:second], len(shifts))
 
 
 def to_beats(

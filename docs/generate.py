@@ -368,6 +368,9 @@ def readme() -> str:
 
 def filled(page: str, name: str, text: str) -> str:
     """Return a page with a text between `<!-- name -->` and `<!-- /name -->`."""
+    for marker in (f"<!-- {name} -->", f"<!-- /{name} -->"):
+        if page.count(marker) != 1:
+            raise ValueError(f"Expected {marker} once, got it {page.count(marker)} times.")
     head, rest = page.split(f"<!-- {name} -->")
     _, tail = rest.split(f"<!-- /{name} -->")
     return f"{head}<!-- {name} -->\n{text}\n<!-- /{name} -->{tail}"

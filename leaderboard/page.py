@@ -270,7 +270,7 @@ def _mixed_presets(results: Sequence[Result]) -> list[str]:
         per_preset.setdefault(r.preset, set()).add(r.hashes.get("config", "none"))
     found: dict[str, set[str]] = {}
     for (title, _), per_preset in settings.items():
-        if len(set.union(*per_preset.values())) > 1 and len(per_preset) > 1:
+        if len({frozenset(configs) for configs in per_preset.values()}) > 1:
             found.setdefault(title, set()).update(per_preset)
     return [
         f"The records of {title} are of presets with different settings: "

@@ -408,7 +408,7 @@ def cards(board: Board, found: Aggregates, unit: str) -> list[dict[str, str]]:
     text += f", over {first.coverage} cells"
     beside = ""
     if len(level) > 1:
-        text = f"Level, with {text[0].lower()}{text[1:]}"
+        text = f"Level: {title} {entry.text} {bracket}".rstrip()
     elif len(order) > 1:
         second = order[1]
         beside = f"Next: {second.title}, {entries[second.method].text} {bracket}".rstrip()

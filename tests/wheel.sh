@@ -5,7 +5,10 @@ set -euo pipefail
 here=$(cd "$(dirname "$0")/.." && pwd)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
-"$here/${VENV:-.venv}/bin/python" -m build --quiet --wheel --outdir "$work/dist" "$here"
+# From a copy: a build writes beside its sources, and tests may be running there.
+mkdir "$work/sources"
+(cd "$here" && git ls-files -z | xargs -0 tar -cf -) | tar -xf - -C "$work/sources"
+"$here/${VENV:-.venv}/bin/python" -m build --quiet --wheel --outdir "$work/dist" "$work/sources"
 if unzip -l "$work"/dist/*.whl 2>/dev/null | grep -qE '\.mat$'; then
     echo "The wheel carries LASA's data." >&2
     exit 1

@@ -4,13 +4,16 @@ A policy of the state alone has a tempo of its own. Told when its strokes are du
 linger without leaving its way: the latent cycle (paper, sec. III-D) has a phase psi that grows at a
 constant rate b, whatever the flow has bent the circle into. `InTimePolicy` steps the model over
 
-    s dt,    s = (d psi* / dt + g (psi* - psi)) / b,    s_min <= s <= s_max,
+    s dt,    s = (psi*(t + dt) - psi*(t) + (1 - exp(-g dt)) (psi* - psi)) / (b dt),
 
-in place of dt, with psi*(t) the phase that is due: a monotone curve (PCHIP) through the phases of
-the notes at their times, each the next of its kind after the note before. As s_min > 0, time alone
-is bent. Every state lies on the orbit that the model itself has through the state before, so that
-what is proved of its orbits - that they come to the cycle, and how V decreases along them - holds
-of them at any pace, s_min b at least.
+with s_min <= s <= s_max, in place of dt. psi*(t) is the phase that is due: a monotone curve (PCHIP)
+through the phases of the notes at their times, each the next of its kind after the note before.
+
+As s_min > 0, time alone is bent: every command leads along the model's own orbit through the state
+that it is given in. So where the mass follows its commands exactly (a point mass, by velocities),
+what is proved of the orbits - that they come to the cycle, and how V decreases along them - holds
+at any pace; it is s_min b at least, unless the greatest speed slows it further. A mass or an arm
+that lags is near the orbits as far as it follows, as with the model by itself.
 """
 
 from __future__ import annotations
@@ -33,7 +36,10 @@ SLOWEST, FASTEST = 0.1, 1.6
 """s_min and s_max: how much slower and faster than the model goes by itself."""
 
 GAIN = 3.0
-"""g in 1/s: what is left of a wrong phase after a third of a second is 1/e of it."""
+"""g in 1/s: within the limits of s, a wrong phase falls to 1/e in a third of a second."""
+
+SAME = 1e-6
+"""Phases in rad that are one: a note after itself is a whole turn ahead, whatever rounding says."""
 
 
 Score = tuple[ArrayLike, ArrayLike]
@@ -44,9 +50,10 @@ Score = tuple[ArrayLike, ArrayLike]
 class InTimePolicy:
     """Plays scores on a model's cycle (see the module).
 
-    Notes that come too fast are played one after another, late. What lies on the way from one note
-    to the next is passed through, asked for or not; after the last one the model goes on at its
-    own pace.
+    Notes that come too fast are played one after another, late; one that is due later than at s_min
+    comes too early. What lies on the way from one note to the next is passed through, asked for or
+    not. A note at 0 s is none: one is where one is. After the last one the model goes on at its own
+    pace.
 
     Its state is its clock and how far it has turned: give the one that `predict` returns back to
     the next call.
@@ -56,7 +63,9 @@ class InTimePolicy:
     model : ImitationFlow
         Fitted on motions that repeat.
     scores : sequence of Score
-        Row i of a batch plays the i-th; of a single one, every row plays it.
+        Row i of a batch plays the i-th; of a single one, every row plays it. `evaluate` rolls out
+        the scored demonstrations, in their order, for accuracy alone with ``stability=False``: give
+        a score for each, or one.
     phases : array, shape (n_notes,)
         psi of the model at each note, in rad, as `rehearsed` finds them for the drumming arm, and
         `phases_of_notes` wherever one knows when the model played them.
@@ -91,11 +100,11 @@ class InTimePolicy:
         self._rate = _rate(model)
         self.model = model
         self.phases = np.asarray(phases, dtype=np.float64)
-        if self.phases.ndim != 1 or not np.isfinite(self.phases).all():
+        if self.phases.ndim != 1 or not self.phases.size or not np.isfinite(self.phases).all():
             raise ValueError(f"Expected finite phases of shape (n_notes,), got {phases!r}.")
-        if not gain > 0:
-            raise ValueError(f"Expected gain > 0 in 1/s, got {gain}.")
-        if not 0 < slowest < 1 < fastest:
+        if not 0 < gain < np.inf:
+            raise ValueError(f"Expected a finite gain > 0 in 1/s, got {gain}.")
+        if not 0 < slowest < 1 < fastest < np.inf:
             raise ValueError(f"Expected 0 < slowest < 1 < fastest, got {slowest} and {fastest}.")
         if not len(scores):
             raise ValueError("Expected at least one score, got none.")
@@ -140,12 +149,14 @@ class InTimePolicy:
         """
         if self._policy is None:
             raise ValueError("Expected an environment, or max_speed and dt, to give actions for.")
-        values = np.asarray(observation, dtype=np.float64)
+        values, dt = self._policy.checked(observation)
+        if values.ndim > 2:
+            raise ValueError(f"Expected observations of shape (d,) or (n, d), got {values.shape}.")
         x = np.atleast_2d(values[..., : self._policy.n_dims])
-        psi = latent_phase(self.model, x)
-        dt = np.broadcast_to(np.asarray(self._policy.dt, dtype=np.float64), len(x))
+        steps = np.broadcast_to(np.asarray(dt, dtype=np.float64), len(x))
         psi = np.sign(self._rate) * latent_phase(self.model, x)
-        dt = np.broadcast_to(np.asarray(self._policy.dt, dtype=np.float64), len(x))
+        lost = ~np.isfinite(psi)  # a state that is not finite: its action is not, either
+        psi[lost] = 0.0
         if state is None:
             begun = np.ones(len(x), dtype=np.bool_)
             state = {"time": np.zeros(len(x)), "turned": psi, "due": [None] * len(x)}
@@ -155,20 +166,20 @@ class InTimePolicy:
                 begun |= np.asarray(episode_start, dtype=np.bool_).reshape(-1)
         time = np.where(begun, 0.0, state["time"])
         # Whole turns count: who is a turn behind has its notes still to play.
-        on = (psi - state["turned"] + np.pi) % TURN - np.pi
+        on = np.where(lost, 0.0, (psi - state["turned"] + np.pi) % TURN - np.pi)
         turned = np.where(begun, psi, state["turned"] + on)
         due = [
             self._due(self._of_row(i, len(x)), psi[i]) if begun[i] else state["due"][i]
             for i in range(len(x))
         ]
-        pace = np.array([self._pace(*row) for row in zip(due, time, turned, dt, strict=True)])
+        pace = np.array([self._pace(*row) for row in zip(due, time, turned, steps, strict=True)])
         action = self._policy.paced(values, pace.reshape(values.shape[:-1]))
-        return action, {"time": time + dt, "turned": turned, "due": due}
+        return action, {"time": time + steps, "turned": turned, "due": due}
 
     def _of_row(self, row: int, n_rows: int) -> list[tuple[float, int]]:
         if len(self._notes) == 1:
             return self._notes[0]
-        if n_rows > len(self._notes):
+        if 1 < n_rows != len(self._notes):
             raise ValueError(
                 f"Expected as many scores as rows, or one for all, got {len(self._notes)} scores "
                 f"and {n_rows} rows."
@@ -182,8 +193,9 @@ class InTimePolicy:
         for time, note in score:
             if time == 0.0:  # played from where one is
                 continue
+            ahead = (sign * self.phases[note] - due[-1]) % TURN
             times.append(time)
-            due.append(due[-1] + (TURN - (due[-1] - sign * self.phases[note]) % TURN))
+            due.append(due[-1] + (ahead if ahead > SAME else ahead + TURN))
         # As far again at the model's own pace, which gives the curve's end its slope.
         times.append(times[-1] + TURN / rate)
         due.append(due[-1] + TURN)
@@ -191,15 +203,22 @@ class InTimePolicy:
 
     def _pace(self, due: PchipInterpolator, time: float, turned: float, dt: float) -> float:
         """Return s of a step that begins at a time, with a phase that has grown since the start."""
-        rate = abs(self._rate)
-        if time + dt > due.x[-2]:
+        rate, end = abs(self._rate), due.x[-2]
+        last = float(due(end))
+        if time >= end and turned >= last:
             return 1.0
-        wanted, following = due(time), due(time + dt)
-        pace = ((following - wanted) / dt + self.gain * (wanted - turned)) / rate
+
+        def wanted(t: float) -> float:
+            return float(due(t)) if t < end else last + rate * (t - end)
+
+        late = -np.expm1(-self.gain * dt) * (wanted(time) - turned)
+        pace = (wanted(time + dt) - wanted(time) + late) / (rate * dt)
         return float(np.clip(pace, self.slowest, self.fastest))
 
     def _checked(self, score: Score, index: int) -> list[tuple[float, int]]:
         """Return a score's notes, each with its time."""
+        if len(score) != 2:
+            raise ValueError(f"Expected times and notes in score {index}, got {score!r}.")
         times, notes = (np.asarray(part) for part in score)
         if times.ndim != 1 or times.shape != notes.shape or not len(times):
             raise ValueError(
@@ -224,6 +243,10 @@ class _Paced(DynamicalSystemPolicy):
     @property
     def n_dims(self) -> int:
         return self._n_dims
+
+    def checked(self, observation: ArrayLike) -> tuple[FloatArray, Any]:
+        """Return observations, shape (..., observation), and their dt."""
+        return self._checked(observation)
 
     def paced(self, observation: FloatArray, pace: FloatArray) -> FloatArray:
         """Return actions for a step of `pace` dt of the system within dt."""
@@ -316,13 +339,15 @@ def rehearsed(model: ImitationFlow, env: Any, *, n_rounds: int = 3) -> FloatArra
     env : DrummingEnv
         Another arm like it is moved.
     n_rounds : int
-        A first one, before the cycle is reached, is not heard.
+        That are heard, after one in which the cycle is reached.
 
     Raises
     ------
     ValueError
-        If a drum is not hit.
+        If a drum is not hit, or no round is to be heard.
     """
+    if n_rounds < 1:
+        raise ValueError(f"Expected n_rounds >= 1, got {n_rounds}.")
     task = env.unwrapped
     lead, heard = (round(n * task.demonstrations.period / task.dt) for n in (1, n_rounds))
     arm = task.like(horizon=lead + heard)
@@ -351,4 +376,8 @@ def _rate(model: ImitationFlow) -> float:
             "Expected a model fitted on motions that repeat: one that comes to a goal has no phase."
         )
     assert isinstance(model._latent, CycleField)
+    if model._latent.turn == 0.0:
+        raise ValueError(
+            "Expected a model that goes round, got one whose latent cycle stands still."
+        )
     return model._latent.turn / model._time

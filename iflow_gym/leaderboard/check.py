@@ -32,7 +32,7 @@ N_SUSPECTS = 3
 """Cells beyond these whose own records speak against a proof: each is scored again, too."""
 
 STATES_SHOWN = 2
-"""States of a cell that contradict a proof and are told, with where each leads."""
+"""States of a cell that contradict a proof in one way and are told, with where each leads."""
 
 MOST_SHOWN = 5
 """Differences of one cell that are told one by one."""
@@ -228,15 +228,18 @@ def _again(result: Result, folder: Path) -> Iterator[Finding]:
         elif system.guarantee != said:
             yield Finding(what, "note", "its class gives another reason for its guarantee by now")
         if "proved" in (system.guarantee.kind, getattr(result.guarantee, "kind", None)):
-            against = list(examine(system, result.environment, result.seed, found.metrics))
-            proofs = [str(each) for each in against if isinstance(each, Contradiction)]
-            for text in proofs[:STATES_SHOWN]:
-                yield Finding(what, "refused", f"claimed proved, but it {text}")
-            if len(proofs) > STATES_SHOWN:
-                yield Finding(what, "refused", f"and from {len(proofs) - STATES_SHOWN} more states")
-            for each in against:
-                if not isinstance(each, Contradiction):
-                    yield Finding(what, "note", str(each))
+            told: Counter[str] = Counter()
+            for against in examine(system, result.environment, result.seed, found.metrics):
+                if not isinstance(against, Contradiction):
+                    yield Finding(what, "note", str(against))
+                    continue
+                told[against.what] += 1
+                if told[against.what] <= STATES_SHOWN:
+                    yield Finding(what, "refused", f"claimed proved, but it {against}")
+            for kind, n in told.items():
+                if n > STATES_SHOWN:
+                    text = f"{kind}: from {n - STATES_SHOWN} more states"
+                    yield Finding(what, "refused", text)
     except UnknownNameError as error:
         yield Finding(what, "unchecked", str(error))
     except Exception as error:

@@ -131,7 +131,7 @@ def _moved(system: Method, task: Any) -> Iterator[Contradiction | Suspicion]:
     if demos.goal is not None:
         under_way = ~gone & ~still & (np.linalg.norm(ends - demos.attractor, axis=1) > tolerance)
         if under_way.any():
-            yield from _followed_round(system, starts[under_way], n_steps, dt, demos.attractor)
+            yield from _followed_round(system, starts[under_way], n_steps, dt, task)
 
 
 def _grid(task: Any) -> tuple[FloatArray, int, float]:
@@ -205,15 +205,17 @@ def _followed_on(
 
 
 def _followed_round(
-    system: Method, starts: FloatArray, n_steps: int, dt: float, goal: FloatArray
+    system: Method, starts: FloatArray, n_steps: int, dt: float, task: Any
 ) -> Iterator[Suspicion]:
     followed = starts[_some(len(starts))]
     n = REST_HORIZONS * n_steps
     with np.errstate(all="ignore"):
         paths = system.rollout(followed, n, dt)  # type: ignore[attr-defined]
-    away = np.linalg.norm(paths - goal, axis=2)
+    demos = task.demonstrations
+    away = np.linalg.norm(paths - demos.attractor, axis=2)
     third, fourth = away[:, n // 2 : 3 * n // 4], away[:, 3 * n // 4 :]
-    no_nearer = ~(fourth.max(axis=1) < third.max(axis=1))
+    arrived = away[:, -1] <= metrics.convergence_tolerance(*scored_box(demos))
+    no_nearer = ~arrived & ~(fourth.max(axis=1) < third.max(axis=1))
     if no_nearer.any():
         yield Suspicion(
             f"of {len(starts)} starts from which it does not arrive in the environment "

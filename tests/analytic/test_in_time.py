@@ -100,6 +100,54 @@ def test_every_step_is_one_of_the_models_own_of_another_duration(learned):
     assert (np.diff(model.lyapunov(path)) <= 1e-12).all()
 
 
+def test_where_the_speed_limit_slows_it_it_keeps_to_the_orbit(learned):
+    _, model, phases = learned
+    dt, limit = 0.02, 60.0  # the egg is drawn at up to twice that
+    policy = InTimePolicy(model, [([0.3, 0.9], [0, 1])], phases, max_speed=limit, dt=dt)
+    path, state, limited = [np.array([70.0, 40.0])], None, 0
+    for _ in range(100):
+        action, state = policy.predict(path[-1], state)
+        assert np.abs(action).max() <= 1 + 1e-9
+        limited += np.abs(action).max() > 1 - 1e-6
+        path.append(path[-1] + dt * limit * action)
+    path = np.array(path)
+    turned = np.diff(np.unwrap(latent_phase(model, path)))
+    rate = np.diff(latent_phase(model, model.rollout(path[:1], 1, 1e-3)[0]))[0] / 1e-3
+    np.testing.assert_allclose(model.step(path[:-1], turned / rate), path[1:], atol=1e-6)
+    assert limited > 30
+    assert (np.diff(model.lyapunov(path)) <= 1e-12).all()
+
+
+@pytest.mark.parametrize("shift", np.linspace(-3.1, 3.1, 12))
+def test_a_note_after_itself_is_a_whole_turn_ahead(learned, shift):
+    demos, model, _ = learned
+    times = [0.4, 2.4, 4.4, 6.4]
+    policy = InTimePolicy(model, [(times, [0] * 4)], [shift], max_speed=1000.0, dt=0.02)
+    x, state = demos.positions[0][0], None
+    turned = []
+    for _ in range(330):
+        action, state = policy.predict(x, state)
+        x = x + 0.02 * 1000.0 * action
+        turned.append(state["turned"][0])
+    assert np.ptp(np.interp(times, 0.02 * np.arange(330), turned)) > 2.9 * 2 * np.pi
+
+
+def test_a_state_that_is_lost_takes_no_other_with_it(learned):
+    demos, model, phases = learned
+    scores = [([0.5, 1.4], [0, 1])]
+    policy = InTimePolicy(model, scores, phases, max_speed=1000.0, dt=0.02)
+    x = demos.positions[0][:2].copy()
+    alone, _ = policy.predict(x[1])
+    x[0] = np.nan
+    both, state = policy.predict(x)
+    assert np.isnan(both[0]).all()
+    np.testing.assert_allclose(both[1], alone, rtol=1e-12)
+    found = x + 0.0
+    found[0] = demos.positions[0][1]
+    again, _ = policy.predict(found, state)
+    assert np.isfinite(again).all()
+
+
 def test_after_the_last_note_it_goes_at_its_own_pace(learned):
     demos, model, phases = learned
     env = arm(demos, horizon=200)
@@ -151,6 +199,9 @@ def test_evaluate_takes_it_as_a_policy(learned):
         ({"scores": [([0.5, 1.0], [0])]}, "one shape"),
         ({"phases": [[0.0, 1.0]]}, "finite phases"),
         ({"phases": [0.0, np.inf]}, "finite phases"),
+        ({"phases": []}, "finite phases"),
+        ({"scores": [[3, 4, 5]]}, "Expected times and notes in score 0"),
+        ({"gain": np.inf}, "finite gain"),
         ({"gain": 0.0}, "gain > 0"),
         ({"slowest": 0.0}, "0 < slowest < 1"),
         ({"fastest": 1.0}, "0 < slowest < 1"),
@@ -168,9 +219,14 @@ def test_it_says_what_is_missing(learned):
     policy = InTimePolicy(model, [([0.5], [0])] * 2, phases)
     with pytest.raises(ValueError, match="an environment, or max_speed and dt"):
         policy.predict([0.0, 0.0])
-    policy = InTimePolicy(model, [([0.5], [0])] * 2, phases, max_speed=1.0, dt=0.1)
-    with pytest.raises(ValueError, match="2 scores and 3 rows"):
-        policy.predict(np.ones((3, 2)))
+    policy = InTimePolicy(model, [([0.5], [0])] * 3, phases, max_speed=1.0, dt=0.1)
+    for n in (2, 4):
+        with pytest.raises(ValueError, match=f"3 scores and {n} rows"):
+            policy.predict(np.ones((n, 2)))
+    with pytest.raises(ValueError, match=r"shape \(..., 2\), got \(3,\)"):
+        policy.predict(np.ones(3))
+    with pytest.raises(ValueError, match=r"\(d,\) or \(n, d\), got \(3, 1, 2\)"):
+        policy.predict(np.ones((3, 1, 2)))
     paths = demos.positions
     with pytest.raises(ValueError, match="a score for each of 2"):
         phases_of_notes(model, paths, 0.02, [([0.5], [0])])
@@ -195,6 +251,9 @@ class TestTheArm:
             observation, _, _, truncated, info = env.step(action)
             hits += info["hits"]
         played = [hit.time for hit in hits], [hit.drum for hit in hits]
+        by_itself = model.rollout(env.demonstrations.positions[3][:1], 999, env.dt)[0]
+        away = latent_phase(model, by_itself)[np.round(times / env.dt).astype(int)] - phases[drums]
+        assert np.abs((away + np.pi) % (2 * np.pi) - np.pi).max() > 0.2  # it is not in time
         assert hit_f1(times, drums, *played) == 1.0
         assert timing_error(times, drums, *played) < 15.0
 
@@ -203,3 +262,5 @@ class TestTheArm:
         model = ImitationFlow(n_steps=1).fit(env.demonstrations, seed=0)
         with pytest.raises(ValueError, match=r"not so drum \d: what this model"):
             rehearsed(model, env, n_rounds=1)
+        with pytest.raises(ValueError, match="n_rounds >= 1, got 0"):
+            rehearsed(model, env, n_rounds=0)
