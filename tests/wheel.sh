@@ -7,7 +7,13 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 # From a copy: a build writes beside its sources, and tests may be running there.
 mkdir "$work/sources"
-(cd "$here" && git ls-files -z | xargs -0 tar -cf -) | tar -xf - -C "$work/sources"
+cd "$here"
+if git ls-files -z >"$work/files" 2>/dev/null; then
+    tar --null -T "$work/files" -cf "$work/sources.tar"
+else # no repository, but what one holds
+    tar --exclude=./.venv --exclude=./results -cf "$work/sources.tar" .
+fi
+tar -xf "$work/sources.tar" -C "$work/sources"
 "$here/${VENV:-.venv}/bin/python" -m build --quiet --wheel --outdir "$work/dist" "$work/sources"
 if unzip -l "$work"/dist/*.whl 2>/dev/null | grep -qE '\.mat$'; then
     echo "The wheel carries LASA's data." >&2
