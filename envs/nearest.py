@@ -60,7 +60,8 @@ class NearestSample:
 
     def _index(self, ops: Arithmetic[Component], point: Sequence[Component]) -> Any:
         if self._cells is None:
-            return self._tree.query(np.stack(point, axis=-1))[1]
+            one: Any = point if isinstance(point[0], float) else np.stack(point, axis=-1)
+            return self._tree.query(one)[1]
         cells = [
             ops.whole(ops.smallest(ops.largest((x - low) * rate, 0.0), self._last_cell))
             for x, low, rate in zip(point, self._low, self._cells_per_length, strict=True)

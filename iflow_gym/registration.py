@@ -49,8 +49,10 @@ def register_all() -> None:
         for letter in LETTERS:
             env_id = letter_id(letter, recorded=name == "LetterRecorded")
             _register(env_id, f"letters:{name}Env", f"letters:{name}VectorEnv", letter=letter)
-    _register(DRUMMING_ID, "drumming.env:DrummingEnv")
-    _register(DRUMMING_RECORDED_ID, "drumming.recorded:DrummingRecordedEnv")
+    arms = "drumming.vector:Drumming"
+    _register(DRUMMING_ID, "drumming.env:DrummingEnv", f"{arms}VectorEnv")
+    recorded = "drumming.recorded:DrummingRecordedEnv"
+    _register(DRUMMING_RECORDED_ID, recorded, f"{arms}RecordedVectorEnv")
 
 
 def registered_ids() -> list[str]:

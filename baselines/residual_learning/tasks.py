@@ -20,14 +20,10 @@ def batch_of(
 ) -> VectorEnv[Any, Any, Any]:
     """Return environments of an id that step together and never begin anew by themselves.
 
-    As one array where the suite has that, else one after the other in this process.
+    In the suite's own way where there is one, else one after the other in this process, as those
+    whose hits are rewarded.
     """
-    if gymnasium.spec(env_id).vector_entry_point is not None:
-        if reward == "hits":
-            raise ValueError(
-                f"Expected an environment with drums for reward='hits', got {env_id!r}: choose a "
-                "preset with reward='environment'."
-            )
+    if not _wrapped(env_id, reward):
         return gymnasium.make_vec(env_id, num_envs, "vector_entry_point", **arguments)
     return gymnasium.make_vec(
         env_id,
@@ -37,6 +33,16 @@ def batch_of(
         wrappers=[HitReward] if reward == "hits" else None,
         **arguments,
     )
+
+
+def _wrapped(env_id: str, reward: Reward) -> bool:
+    """Whether environments are stepped one by one, since each is wrapped or there is no batch."""
+    if reward == "hits" and not hasattr(gymnasium.make(env_id).unwrapped, "drums"):
+        raise ValueError(
+            f"Expected an environment with drums for reward='hits', got {env_id!r}: choose a "
+            "preset with reward='environment'."
+        )
+    return reward == "hits" or gymnasium.spec(env_id).vector_entry_point is None
 
 
 def residual_vec_env(
@@ -70,7 +76,7 @@ def returns_of(
     """
     task: Any = gymnasium.make(env_id).unwrapped
     indices = range(len(task.demonstrations.shown))
-    if gymnasium.spec(env_id).vector_entry_point is None:
+    if _wrapped(env_id, reward):
         own = HitReward(task) if reward == "hits" else task
         env = ResidualActionWrapper(own, base_policy, scale, stable=stable)
         return np.array([_episode(agent, env, i).reward for i in indices])
@@ -83,6 +89,7 @@ def returns_of(
         actions, _ = agent.predict(observations, deterministic=True)
         observations, rewards, _, _, _ = envs.step(actions)
         sums += np.where(k < lengths, rewards, 0.0)
+    envs.close()
     return np.asarray(sums / lengths)
 
 

@@ -41,7 +41,9 @@ CORE = (
 NOT_SCORED = (
     "iflow_gym",
     "iflow_gym.datasets",
+    "iflow_gym.envs.drumming.crew",
     "iflow_gym.envs.drumming.rendering",
+    "iflow_gym.envs.drumming.vector",
     "iflow_gym.envs.guide",
     "iflow_gym.envs.nearest",
     "iflow_gym.envs.rendering",
@@ -49,7 +51,8 @@ NOT_SCORED = (
     "iflow_gym.registration",
     "iflow_gym.results",
 )
-"""Modules that no score depends on: the data have a hash of their own, rewards are not scored."""
+"""Modules that no score depends on: the data have a hash of their own, rewards are not scored, and
+the arms of a score are moved in one process."""
 
 OTHER_MOTIONS: dict[Motion, tuple[str, ...]] = {
     "goal": ("iflow_gym.evaluation.cycles", "iflow_gym.evaluation.drumming"),
@@ -109,14 +112,14 @@ def core_hash(entry_points: tuple[str, ...], motion: Motion) -> str:
     Parameters
     ----------
     entry_points
-        Modules of the environment and of its batch. What they import counts, and what evaluates
-        motions of this kind: an environment of another family, or metrics of another kind of
-        motion, can be added without a record becoming stale.
+        Modules of the environment and of its batch, if scores depend on that. What they import
+        counts, and what evaluates motions of this kind: an environment of another family, or
+        metrics of another kind of motion, can be added without a record becoming stale.
     motion
         Whether its demonstrations end at a goal or repeat.
     """
     left_out = (*NOT_SCORED, *OTHER_MOTIONS[motion])
-    roots = ("iflow_gym.baselines.runner.scoring", *entry_points)
+    roots = ("iflow_gym.baselines.runner.scoring", *(p for p in entry_points if p not in left_out))
 
     def wanted(name: str) -> bool:
         return _within(name, CORE) and name not in left_out and not _within(name, (METRICS,))

@@ -258,9 +258,10 @@ def _shortened(vector: FloatArray, most: float) -> FloatArray:
 
 def _largest_scale(free: FloatArray, part: FloatArray, low: FloatArray, high: FloatArray) -> float:
     """Return the largest s in [0, 1] with low <= free + s part <= high; free is within."""
-    room = np.where(part > 0, high - free, free - low)
-    size = np.abs(part)
-    over = size > room
-    if not over.any():
-        return 1.0
-    return float(max((room[over] / size[over]).min(), 0.0))
+    scale = 1.0
+    ends = zip(part.tolist(), free.tolist(), low.tolist(), high.tolist(), strict=True)
+    for by, begin, least, most in ends:
+        room = most - begin if by > 0 else begin - least
+        if abs(by) > room:
+            scale = min(scale, room / abs(by))
+    return max(scale, 0.0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Final, SupportsFloat, cast
 
 import gymnasium
@@ -25,7 +27,7 @@ from iflow_gym.envs.drumming.arms import Arms
 from iflow_gym.envs.drumming.control import CONTROL_DT
 from iflow_gym.envs.drumming.scene import TORQUE_LIMITS
 from iflow_gym.envs.drumming.simulation import Simulation, UnreachableError
-from iflow_gym.envs.dynamics import FLOATS, scaled_into_box
+from iflow_gym.envs.dynamics import FLOATS, excess, scaled_into_box
 from iflow_gym.envs.guide import Guide, guide_for
 from iflow_gym.envs.task import START_NOISE, Push
 from iflow_gym.metrics import Motion
@@ -430,11 +432,12 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
             raise ValueError(
                 f"Expected an action of shape {self.action_space.shape}, got {values.shape}."
             )
-        if not np.isfinite(values).all():
+        components = values.tolist()
+        if not all(map(math.isfinite, components)):
             raise ValueError(
                 f"Expected a finite action, got {values}: the policy gave NaN or infinity."
             )
-        values = scaled_into_box(values)
+        values = values / excess(FLOATS, components)
         simulation, before = self.simulation, self._tip
         controller = simulation.controller
         if self.control_mode == "velocity":
@@ -468,7 +471,7 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         info = self._info(reached if target is None else target, scale, tuple(hits), measures)
         return self._observation(), reward, False, truncated, info
 
-    @property
+    @cached_property
     def _guide(self) -> Guide:
         return guide_for(self.demonstrations.shown)
 
@@ -570,9 +573,9 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
         if self._renderer is None:
             from iflow_gym.envs.drumming.rendering import Renderer
 
-            self._renderer = Renderer(self.simulation.scene, self.width, self.height)
+            self._renderer = Renderer(self.drums, self.width, self.height)
         simulation = self.simulation
-        return self._renderer.frame(simulation.data, self._trail, simulation.peak_forces)
+        return self._renderer.frame(simulation.data.qpos, self._trail, simulation.peak_forces)
 
     def close(self) -> None:
         """Free what OpenGL holds."""

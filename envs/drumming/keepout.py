@@ -8,11 +8,12 @@ sphere, so the cylinder is wider than the drum by its radius.
 
 With r the horizontal distance from the drum's axis, outside means above the face, r <= R and
 z >= f, or beside the wall, r >= R. Below the face and within the wall, the nearer of the two leads
-out. Beside the wall r is that of the stick, which lies behind the tip and rises: of its point
-nearest to the axis among those below the face. Its orientation is held, so that all of it moves as
-the tip does. Where a wall takes off of a command, the tip rises at least as fast as was taken off,
-up to `CLIMB`: over a drum the way is free, and a command that leads into a wall and down it, or
-into the wedge between a wall and the border of the workspace, would come to rest there for ever.
+out, at up to `CLIMB`, however deep it is. Beside the wall r is that of the stick, which lies behind
+the tip and rises: of its point nearest to the axis among those below the face. Its orientation is
+held, so that all of it moves as the tip does. Where a wall takes off of a command, the tip rises at
+least as fast as was taken off, up to `CLIMB`: over a drum the way is free, and a command that leads
+into a wall and down it, or into the wedge between a wall and the border of the workspace, would
+come to rest there for ever.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ BRAKING_TIME: Final = 0.03
 slowed before it meets the head."""
 
 CLIMB: Final = 0.1
-"""Speed in m/s up to which a tip that is led into a wall rises."""
+"""Speed in m/s up to which a tip that is led into a wall rises, and out of a drum it is led."""
 
 REACH: Final = float((STICK_FRONT + STICK_BACK) * np.cos(STICK_PITCH))
 """Horizontal length of the stick behind the tip, along -x, in m."""
@@ -65,7 +66,7 @@ class KeepOut:
             r = hypot(across, along)
             above, beside = z - face, r - wall
             if beside <= 0.0 and above >= beside:
-                least = -above / BRAKING_TIME
+                least = min(-above / BRAKING_TIME, CLIMB)
                 if velocity[2] < least:
                     velocity = np.array([velocity[0], velocity[1], least])
             elif above < 0.0:
@@ -75,7 +76,7 @@ class KeepOut:
                 beside = r - wall
                 # On the axis every way out is as short.
                 out = np.array([across / r, along / r, 0.0] if r else [1.0, 0.0, 0.0])
-                least, towards = -beside / BRAKING_TIME, float(out @ velocity)
+                least, towards = min(-beside / BRAKING_TIME, CLIMB), float(out @ velocity)
                 if towards < least:
                     velocity = velocity + (least - towards) * out
                     velocity[2] = max(velocity[2], min(least - towards, CLIMB))

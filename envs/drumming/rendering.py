@@ -13,9 +13,10 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
+from iflow_gym.datasets.drums import Drum
 from iflow_gym.demonstrations import FloatArray
 from iflow_gym.envs.drumming.engine import LIBRARIES, has_library, mujoco
-from iflow_gym.envs.drumming.scene import Scene
+from iflow_gym.envs.drumming.scene import drawn_model, head_geoms
 from iflow_gym.metrics.drumming import FORCE_THRESHOLD
 
 INSTALL: Final = (
@@ -62,17 +63,18 @@ def open_context(model: Any, width: int, height: int) -> tuple[Any, Any]:
 
 
 class Renderer:
-    """Draws a scene, and the tip's way, as the camera called "front" sees it."""
+    """Draws the arm at its drums, and the tip's way, as the camera called "front" sees it."""
 
-    def __init__(self, scene: Scene, width: int, height: int) -> None:
-        model = scene.model
+    def __init__(self, drums: tuple[Drum, ...], width: int, height: int) -> None:
+        model = drawn_model(drums)
         limits = model.vis.global_
         if not (0 < width <= limits.offwidth and 0 < height <= limits.offheight):
             raise ValueError(
                 f"Expected a picture of at most {limits.offwidth} x {limits.offheight} pixels, got "
                 f"{width} x {height}."
             )
-        self._model, self._heads = model, scene.head_geoms
+        self._model, self._data = model, mujoco.MjData(model)
+        self._heads = head_geoms(model, drums)
         self._gl, self._context = open_context(model, width, height)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
@@ -86,22 +88,25 @@ class Renderer:
         self._free = weakref.finalize(self, _free, self._gl, self._context)
 
     def frame(
-        self, data: Any, trail: Sequence[FloatArray] = (), forces: Sequence[float] = ()
+        self, posture: FloatArray, trail: Sequence[FloatArray] = (), forces: Sequence[float] = ()
     ) -> NDArray[np.uint8]:
         """Return a picture, shape (height, width, 3).
 
         Parameters
         ----------
-        data : mujoco.MjData
-            The state to draw.
+        posture : array, shape (7,)
+            Joint angles in rad.
         trail : sequence of arrays, shape (3,)
             Where the tip was, in m; the last `TRAIL` are drawn.
         forces : sequence of float
             On each head in N: one that is hit is coloured.
         """
+        self._data.qpos[:] = posture
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
         self._gl.make_current()
         mujoco.mjv_updateScene(
-            self._model, data, self._options, None, self._camera,
+            self._model, self._data, self._options, None, self._camera,
             mujoco.mjtCatBit.mjCAT_ALL.value, self._scene,
         )  # fmt: skip
         struck = {g for g, i in self._heads.items() if i < len(forces) and forces[i] >= STRUCK}

@@ -9,6 +9,8 @@ nothing of it is copied. Its kinematics, masses and shapes stay as they are. Wha
 - Gravity is compensated, as the real arm does by itself.
 - The links touch drums and floor, not each other: the task-space controller stays where they
   could not.
+- The meshes that only look good are left out where nothing is drawn: MuJoCo clears a flag for each
+  node of each mesh in every physics step, and theirs are 98 % of all.
 - Motors take torques; the controller is `iflow_gym.envs.drumming.control`.
 """
 
@@ -102,7 +104,6 @@ class Scene:
 def load_scene(drums: tuple[Drum, ...]) -> Scene:
     """Compile the scene, once a process for each kit."""
     model = mujoco.MjModel.from_xml_string(scene_xml(drums))
-    heads = {model.geom(f"head:{drum.name}").id: i for i, drum in enumerate(drums)}
     stick = [model.geom(name).id for name in ("stick:bead", "stick:shaft")]
     ranges = model.jnt_range.copy()
     ranges.setflags(write=False)
@@ -112,15 +113,28 @@ def load_scene(drums: tuple[Drum, ...]) -> Scene:
         tip=model.site("tip").id,
         stick=model.body("stick").id,
         stick_geoms=frozenset(stick),
-        head_geoms=heads,
+        head_geoms=head_geoms(model, drums),
         orientation=np.eye(3),
         lower=ranges[:, 0],
         upper=ranges[:, 1],
     )
 
 
-def scene_xml(drums: Sequence[Drum]) -> str:
-    """Return the scene in MuJoCo's XML, with absolute paths to the arm's meshes."""
+def drawn_model(drums: tuple[Drum, ...]) -> Any:
+    """Return a mujoco.MjModel of the same scene, with the meshes that are drawn."""
+    return mujoco.MjModel.from_xml_string(scene_xml(drums, drawn=True))
+
+
+def head_geoms(model: Any, drums: Sequence[Drum]) -> dict[int, int]:
+    """Return the geom of each head in a model -> the index of its drum."""
+    return {model.geom(f"head:{drum.name}").id: i for i, drum in enumerate(drums)}
+
+
+def scene_xml(drums: Sequence[Drum], *, drawn: bool = False) -> str:
+    """Return the scene in MuJoCo's XML, with absolute paths to the arm's meshes.
+
+    The same bodies move in the same way whether or not it is to be `drawn`.
+    """
     folder = assets_folder()
     root = ElementTree.Element("mujoco", model="drumming")
     _element(root, "compiler", angle="radian", meshdir=str(folder / "meshes"), autolimits="true")
@@ -146,6 +160,8 @@ def scene_xml(drums: Sequence[Drum]) -> str:
         _add_drum(world, drum)
     arm = ElementTree.parse(folder / "chain.xml").getroot()[0]
     _prepare_arm(arm)
+    if not drawn:
+        _strip_looks(root, arm)
     world.append(arm)
     actuators = _element(root, "actuator")
     for index, limit in enumerate(TORQUE_LIMITS.tolist(), start=1):
@@ -181,6 +197,19 @@ def _prepare_arm(arm: ElementTree.Element) -> None:
                 geom.set("conaffinity", "2")
     hand = next(body for body in arm.iter("body") if body.get("name") == "panda0_link7")
     _add_stick(hand)
+
+
+def _strip_looks(root: ElementTree.Element, arm: ElementTree.Element) -> None:
+    """Remove the arm's geoms that are only drawn, and the meshes that no geom is left to use."""
+    for body in arm.iter("body"):
+        for geom in body.findall("geom"):
+            if geom.get("class") == "panda_viz":
+                body.remove(geom)
+    used = {geom.get("mesh") for geom in arm.iter("geom")}
+    for asset in root.findall("asset"):
+        for mesh in asset.findall("mesh"):
+            if mesh.get("name") not in used:
+                asset.remove(mesh)
 
 
 def _add_stick(hand: ElementTree.Element) -> None:

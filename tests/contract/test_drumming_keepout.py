@@ -78,7 +78,16 @@ def test_deep_inside_a_command_leads_out_the_nearer_way():
 def test_on_the_axis_deep_inside_any_way_out_will_do():
     inside = RIGHT.head - np.array([0.0, 0.0, WALL + 0.1])
     out = KeepOut((RIGHT,)).slid(inside, np.zeros(3))
-    assert np.hypot(*out[:2]) == pytest.approx(WALL / BRAKING_TIME)
+    assert np.hypot(*out[:2]) == pytest.approx(CLIMB)
+
+
+@given(point=vector, velocity=vector)
+def test_out_of_a_drum_leads_what_is_commanded_or_a_climb_however_deep(point, velocity):
+    point = point + RIGHT.head
+    slid = KeepOut((RIGHT,)).slid(point, velocity)
+    most = np.linalg.norm(velocity) + CLIMB
+    assert np.linalg.norm(slid[:2]) <= most + 1e-12
+    assert velocity[2] <= slid[2] <= max(velocity[2], CLIMB) + 1e-12
 
 
 @given(point=vector, velocity=vector)
@@ -105,7 +114,8 @@ def depth_of_stick(drum, point):
     behind = np.linspace(0.0, REACH, 4000)[:, None] * [-1.0, 0.0, RISE]
     stick = point + behind
     r = np.hypot(*(stick[:, :2] - drum.head[:2]).T)
-    return np.minimum(FACE - stick[:, 2], drum.radius + RIM + TIP_RADIUS - r).max() + 1e-4
+    face = drum.head[2] + TIP_RADIUS - FOLLOW_THROUGH
+    return np.minimum(face - stick[:, 2], drum.radius + RIM + TIP_RADIUS - r).max() + 1e-4
 
 
 def test_an_arm_that_is_led_through_a_head_slides_off_it():
