@@ -153,8 +153,8 @@ def test_what_cannot_be_adapted_is_refused():
             refused()
 
 
-def test_arms_whose_hits_are_rewarded_are_trained_one_after_the_other_and_begin_anew():
-    env = residual_vec_env("iflow/Drumming-v0", 2, None, 0.4, False, reward="hits")
+def test_arms_are_trained_one_after_the_other_and_begin_anew():
+    env = residual_vec_env("iflow/Drumming-v0", 2, None, 0.4, False)
     env.seed(0)
     env.reset()
     for arm in env.env.unwrapped.envs:

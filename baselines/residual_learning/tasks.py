@@ -6,12 +6,14 @@ from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from iflow_gym.baselines.residual_learning.settings import Reward
 from iflow_gym.baselines.residual_learning.vec_env import ArrayVecEnv
 from iflow_gym.demonstrations import FloatArray
 from iflow_gym.envs.hit_reward import HitReward, Stroke
+from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
 from iflow_gym.residual.wrapper import ResidualActionWrapper, ResidualVectorWrapper
 
 
@@ -20,10 +22,14 @@ def batch_of(
 ) -> VectorEnv[Any, Any, Any]:
     """Return environments of an id that step together and never begin anew by themselves.
 
-    In the suite's own way where there is one, else one after the other in this process, as those
-    whose hits are rewarded.
+    As one array where the suite has that, else one after the other in this process.
     """
-    if not _wrapped(env_id, reward):
+    if _one_array(env_id):
+        if reward == "hits":
+            raise ValueError(
+                f"Expected an environment with drums for reward='hits', got {env_id!r}: choose a "
+                "preset with reward='environment'."
+            )
         return gymnasium.make_vec(env_id, num_envs, "vector_entry_point", **arguments)
     return gymnasium.make_vec(
         env_id,
@@ -35,14 +41,11 @@ def batch_of(
     )
 
 
-def _wrapped(env_id: str, reward: Reward) -> bool:
-    """Whether environments are stepped one by one, since each is wrapped or there is no batch."""
-    if reward == "hits" and not hasattr(gymnasium.make(env_id).unwrapped, "drums"):
-        raise ValueError(
-            f"Expected an environment with drums for reward='hits', got {env_id!r}: choose a "
-            "preset with reward='environment'."
-        )
-    return reward == "hits" or gymnasium.spec(env_id).vector_entry_point is None
+def _one_array(env_id: str) -> bool:
+    """Whether the suite steps many environments of an id as one array, in this process."""
+    point = gymnasium.spec(env_id).vector_entry_point
+    made: Any = load_env_creator(point) if isinstance(point, str) else point
+    return isinstance(made, type) and issubclass(made, PointMassVectorEnv)
 
 
 def residual_vec_env(
@@ -76,7 +79,7 @@ def returns_of(
     """
     task: Any = gymnasium.make(env_id).unwrapped
     indices = range(len(task.demonstrations.shown))
-    if _wrapped(env_id, reward):
+    if not _one_array(env_id):
         own = HitReward(task) if reward == "hits" else task
         env = ResidualActionWrapper(own, base_policy, scale, stable=stable)
         return np.array([_episode(agent, env, i).reward for i in indices])
@@ -89,7 +92,6 @@ def returns_of(
         actions, _ = agent.predict(observations, deterministic=True)
         observations, rewards, _, _, _ = envs.step(actions)
         sums += np.where(k < lengths, rewards, 0.0)
-    envs.close()
     return np.asarray(sums / lengths)
 
 
