@@ -1,10 +1,11 @@
-"""Makes the pictures of docs/drumming.md: `python docs/drumming.py`, a minute.
+"""Makes the pictures and the sound of docs/drumming.md: `python docs/drumming.py`, a minute.
 
 docs/images/drumming.gif          a demonstration replayed by the arm, one round
 docs/images/drumming.png          the demonstrations in space, and when which drum is hit
 docs/images/drumming-learned.gif  ImitationFlow drums, one round after two others
 docs/images/drumming-learned.png  its path among the demonstrations, and when it hits which drum
 docs/images/drumming-in-time.png  when it hits which drum by itself, and when it is given a score
+docs/sounds/drumming-learned.wav  what the round of drumming-learned.gif sounds like
 
 ImitationFlow is the leaderboard's model of seed 0.
 """
@@ -24,11 +25,13 @@ from iflow_gym.baselines.imitation_flow.in_time import InTimePolicy, rehearsed
 from iflow_gym.datasets.drums import DRUMS, load_drums
 from iflow_gym.envs.drumming.control import CONTROL_DT
 from iflow_gym.envs.drumming.env import DrummingEnv
+from iflow_gym.envs.drumming.sound import write_sound
 from iflow_gym.figures import save_figure
-from iflow_gym.metrics.drumming import FORCE_THRESHOLD, rhythm
+from iflow_gym.metrics.drumming import FORCE_THRESHOLD, Hit, rhythm
 from iflow_gym.plotting import DEMONSTRATION, INK, ROLLOUT
 
 IMAGES = Path(__file__).parent / "images"
+SOUNDS = Path(__file__).parent / "sounds"
 MODEL = (
     Path(__file__).resolve().parents[1]
     / "leaderboard/results/imitation-flow/Drumming-v0.reproduction.seed0.safetensors"
@@ -63,15 +66,16 @@ def played(env: DrummingEnv, policy: Any, index: int) -> Iterator[dict]:
         yield info | {"tip": observation}
 
 
-def moving(env: DrummingEnv, infos: Iterator[dict], name: str, begin: int = 0) -> None:
-    """Draw one round from a step on as a GIF."""
+def moving(env: DrummingEnv, infos: Iterator[dict], name: str, begin: int = 0) -> list[Hit]:
+    """Draw one round from a step on as a GIF; return its hits, in its own time."""
     n_frames = round(env.demonstrations.period / (EVERY * env.dt))
-    frames, struck = [], []
+    frames, struck, hits = [], [], []
     for k, info in enumerate(infos):
         if k >= begin and k % EVERY == 0 and len(frames) < n_frames:
             frames.append(env.render())
             if info["forces"].max() >= FORCE_THRESHOLD:
                 struck.append(frames[-1])
+        hits += [hit._replace(time=hit.time - begin * env.dt) for hit in info["hits"]]
     # One palette for all frames, and no dither: what stands still then compresses to nothing. The
     # strokes count more, for the sake of their colour.
     sheet = Image.fromarray(np.concatenate([*frames[::12], *struck, *struck]))
@@ -85,6 +89,7 @@ def moving(env: DrummingEnv, infos: Iterator[dict], name: str, begin: int = 0) -
         loop=0,
         optimize=True,
     )
+    return [hit for hit in hits if 0 <= hit.time < n_frames * EVERY * env.dt]
 
 
 def drawing() -> tuple[Figure, Any, Any, Any]:
@@ -226,8 +231,9 @@ def main() -> None:
     turn = round(load_drums().period / CONTROL_DT)
     env = DrummingEnv(horizon=3 * turn + EVERY, **size)
     policy = DynamicalSystemPolicy(system, env)
-    moving(env, played(env, policy, SHOWN), "drumming-learned.gif", begin=2 * turn)
+    hits = moving(env, played(env, policy, SHOWN), "drumming-learned.gif", begin=2 * turn)
     env.close()
+    write_sound(SOUNDS / "drumming-learned.wav", hits, seconds=turn * env.dt)
 
 
 if __name__ == "__main__":

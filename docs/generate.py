@@ -199,8 +199,9 @@ def environments() -> str:
 `import iflow_gym` registers the environments. `"iflow_gym:iflow/LASA-Angle-v0"` imports it by
 itself, in another process for instance. Rendering needs no OpenGL, but for the drumming arm.
 
-The batched version steps all at once in NumPy and gives the bits that the single one gives:
-`gym.make_vec(id, num_envs=1024, vectorization_mode="vector_entry_point")`.
+The batched version gives the bits that the single one gives:
+`gym.make_vec(id, num_envs=1024, vectorization_mode="vector_entry_point")`. Point masses are stepped
+all at once in NumPy; arms, one after the other, in as many processes as there are processors.
 
 All have the demonstrations, a dataset of transitions and a score built in, on the unwrapped
 environment: `demonstrations`, `get_dataset(split)` and `score(system, seed=0)`. To add one, see

@@ -7,6 +7,9 @@ to do is another; a pipe carries the word to begin, the hits, and whatever is ra
 from __future__ import annotations
 
 import contextlib
+import copy
+import os
+import pickle
 import signal
 import time
 import traceback
@@ -81,9 +84,8 @@ class Columns:
 class Plan(NamedTuple):
     """What a crew is made of; it goes into the crew's process."""
 
-    arm: type[DrummingEnv]
     settings: dict[str, Any]
-    """The arms' arguments."""
+    """Arguments of `DrummingEnv`."""
     columns: Columns
     share: range
     """Which of all arms they are."""
@@ -103,15 +105,15 @@ class Crew:
     """Some of the arms; methods return a value for each."""
 
     def __init__(self, plan: Plan, n: int) -> None:
-        self._arms = [plan.arm(**plan.settings) for _ in plan.share]
+        self._arms = [DrummingEnv(**plan.settings) for _ in plan.share]
         self._share, self._columns = plan.share, plan.columns
         own = slice(plan.share.start, plan.share.stop)
         self._rows, self._actions = shared(plan.rows, n)[own], shared(plan.actions, n)[own]
         self._ended = [False] * len(self._arms)
 
     def reset(self, orders: Sequence[Order | None]) -> None:
-        """Begin an episode with each arm that has an order; they are those of all arms."""
-        for i, order in enumerate(orders[self._share.start : self._share.stop]):
+        """Begin an episode with each arm that has an order."""
+        for i, order in enumerate(orders):
             if order is not None:
                 self._begin(i, *order)
 
@@ -134,45 +136,49 @@ class Crew:
         return hits
 
     def generators(self) -> list[np.random.Generator]:
-        """Return the arms' random number generators."""
-        return [arm.np_random for arm in self._arms]
+        """Return copies of the arms' random number generators."""
+        return [copy.deepcopy(arm.np_random) for arm in self._arms]
 
     def seeds(self) -> list[int]:
         """Return the arms' seeds."""
         return [arm.np_random_seed for arm in self._arms]
 
     def actions_of(self, commands: FloatArray, observations: FloatArray) -> list[FloatArray]:
-        """Return the actions of commands, shape (n, 3) of all arms, in states."""
-        own = slice(self._share.start, self._share.stop)
-        triples = zip(self._arms, commands[own], observations[own], strict=True)
+        """Return the actions of commands, shape (n, 3), in states, shape (n, observation)."""
+        triples = zip(self._arms, commands, observations, strict=True)
         return [arm.command_to_action(command, state) for arm, command, state in triples]
 
 
 class CrewProcess:
-    """A `Crew` in a process of its own: what is begun goes on there until it is asked for."""
+    """A `Crew` in a process of its own: what is begun goes on there until it is asked for.
+
+    One question at a time. Where an answer was not waited for, or raised, the process is of no
+    further use: `end` it.
+    """
 
     def __init__(self, context: Any, plan: Plan, n: int) -> None:
         self._pipe, theirs = context.Pipe()
-        self._share = plan.share
-        self._process = context.Process(
-            target=_serve,
-            args=(theirs, self._pipe, plan, n),
-            name=f"arms {plan.share.start} to {plan.share.stop - 1}",
-            daemon=True,
+        self._owner = os.getpid()
+        first, last = plan.share.start, plan.share.stop - 1
+        self.name = f"arm {first}" if first == last else f"arms {first} to {last}"
+        self.process = context.Process(
+            target=_serve, args=(theirs, self._pipe, plan, n), name=self.name, daemon=True
         )
-        self._process.start()
+        self.process.start()
         theirs.close()
-        self._asked = 0
 
     def begin(self, method: str, *arguments: Any) -> None:
-        """Let a method of the crew be called."""
-        while self._asked:  # an interrupt came between a question and its answer
-            self.result()
+        """Let a method of the crew be called.
+
+        Raises
+        ------
+        RuntimeError
+            If the process has ended.
+        """
         try:
             self._pipe.send((method, arguments))
         except OSError as error:
-            raise self._ended() from error
-        self._asked += 1
+            raise self._lost() from error
 
     def result(self) -> Any:
         """Return what it returned.
@@ -187,31 +193,50 @@ class CrewProcess:
         try:
             value, error, where = _received(self._pipe)
         except (EOFError, OSError) as end:
-            raise self._ended() from end
-        self._asked -= 1
+            raise self._lost() from end
         if error is not None:
-            raise error from RuntimeError(f"in the process of {self._process.name}:\n{where}")
+            raise error from RuntimeError(f"in the process of {self.name}:\n{where}")
         return value
 
-    def _ended(self) -> RuntimeError:
-        self._process.join(timeout=1.0)
+    @property
+    def is_ours(self) -> bool:
+        """Whether this process began it, and is not a fork of the one that did."""
+        return os.getpid() == self._owner
+
+    def dismiss(self, *, terminate: bool) -> None:
+        """Let the process end: at once, or when it has answered."""
+        if terminate:
+            self.process.terminate()
+            return
+        with contextlib.suppress(OSError):  # it has ended by itself
+            self._pipe.send(None)
+
+    def bury(self, timeout: float) -> None:
+        """Wait for the process's end; after so many seconds kill it."""
+        self.process.join(timeout)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+        self._pipe.close()
+
+    def _lost(self) -> RuntimeError:
+        self.process.join(timeout=1.0)
+        code = self.process.exitcode
+        why = " (it was killed, maybe for want of memory)" if code == -signal.SIGKILL else ""
         return RuntimeError(
-            f"Expected an answer of the process that moves {self._process.name}, but it ended with "
-            f"exit code {self._process.exitcode} (-9: it was killed, maybe for want of memory): "
-            "make the environment anew."
+            f"Expected an answer of the process of {self.name}, but it ended with exit code "
+            f"{code}{why}: reset() begins anew in new processes."
         )
 
-    def close(self, timeout: float | None = None, *, terminate: bool = False) -> None:
-        """End the process: at once, or when it is done with what was begun."""
-        if terminate:
-            self._process.terminate()
-        with contextlib.suppress(OSError):  # it has ended
-            self._pipe.send(None)
-        self._pipe.close()
-        self._process.join(5.0 if timeout is None else timeout)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+
+def end(crews: list[CrewProcess], timeout: float = 5.0, *, terminate: bool = True) -> None:
+    """End the processes of crews and forget them: at once, or when they have answered."""
+    own = [crew for crew in crews if crew.is_ours]
+    for crew in own:
+        crew.dismiss(terminate=terminate)
+    for crew in own:
+        crew.bury(timeout)
+    crews.clear()
 
 
 def _received(pipe: Connection) -> Any:
@@ -226,6 +251,7 @@ def _serve(pipe: Connection, other_end: Connection, plan: Plan, n: int) -> None:
     """Do what comes through a pipe until None does, or until its other end is closed."""
     other_end.close()  # a fork has it too, and would never see it closed
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for who asked
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     crew: Crew | None = None
     while True:
         try:
@@ -240,8 +266,17 @@ def _serve(pipe: Connection, other_end: Connection, plan: Plan, n: int) -> None:
             crew = crew or Crew(plan, n)
             answer = getattr(crew, method)(*arguments), None, ""
         except Exception as error:
-            answer = None, error, traceback.format_exc()
+            answer = None, _travelling(error), traceback.format_exc()
         try:
             pipe.send(answer)
         except OSError:
             return
+
+
+def _travelling(error: Exception) -> Exception:
+    """Return an error if it comes through a pipe whole, else one that says what it was."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error

@@ -65,7 +65,8 @@ class DrummingEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     `env.unwrapped` has `demonstrations`, `drums`, `dt`, `max_speed`, `n_dims`, the conversions
     `velocity_to_action`, `action_to_velocity` and `command_to_action`, `score_of` (the notes that
-    a demonstration implies), `get_dataset` and `score`; wrappers hide them.
+    a demonstration implies), `get_dataset` and `score`; wrappers hide them. For many arms at once,
+    `gymnasium.make_vec(id, num_envs=n)` gives a batch whose processes share them out.
 
     ## Action Space
     An action whose largest component exceeds 1 is divided by it, as a whole: no component is

@@ -6,6 +6,7 @@ import importlib
 import os
 import weakref
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Final
 
@@ -62,11 +63,14 @@ def open_context(model: Any, width: int, height: int) -> tuple[Any, Any]:
     return gl, context
 
 
+_drawn = lru_cache(maxsize=8)(drawn_model)
+
+
 class Renderer:
     """Draws the arm at its drums, and the tip's way, as the camera called "front" sees it."""
 
     def __init__(self, drums: tuple[Drum, ...], width: int, height: int) -> None:
-        model = drawn_model(drums)
+        model = _drawn(drums)
         limits = model.vis.global_
         if not (0 < width <= limits.offwidth and 0 < height <= limits.offheight):
             raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import weakref
 from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from iflow_gym.datasets.drums import Drum
 from iflow_gym.demonstrations import Demonstrations, FloatArray
 from iflow_gym.envs.drumming.arguments import checked_options
-from iflow_gym.envs.drumming.crew import Columns, Crew, CrewProcess, Plan, shared
+from iflow_gym.envs.drumming.crew import Columns, Crew, CrewProcess, Plan, end, shared
 from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.recorded import DrummingRecordedEnv
 from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
@@ -54,10 +55,12 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
     Parameters
     ----------
     num_envs : int
+        How many arms, n.
     processes : int, optional
         At most so many, this one among them; None takes the processors that this process may use.
     context : str, optional
-        How processes begin, of `multiprocessing.get_context`.
+        How processes begin, of `multiprocessing.get_context`. Where they are spawned, as they are
+        by default on macOS, a script makes the batch under ``if __name__ == "__main__":``.
     **settings
         Arguments of `DrummingEnv`. There is no rendering.
 
@@ -88,7 +91,7 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
                 f"Expected render_mode None, got {render_mode!r}: the batch does not render; use "
                 "gymnasium.make_vec(..., vectorization_mode='sync')."
             )
-        self.num_envs = num_envs
+        self.num_envs = num_envs = int(num_envs)
         self._task = self.arm(**settings)
         self.single_observation_space = self._task.observation_space
         self.single_action_space = self._task.action_space
@@ -99,17 +102,20 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         (n_actions,) = cast("tuple[int]", self.single_action_space.shape)
         if processes is None:  # a daemon, such as a worker of another batch, can have none
             processes = 1 if multiprocessing.current_process().daemon else available_cores()
-        system = multiprocessing.get_context(context)
-        rows = system.RawArray("d", num_envs * self._columns.width)
-        actions = system.RawArray("d", num_envs * n_actions)
+        self._context: Any = multiprocessing.get_context(context)
+        rows = self._context.RawArray("d", num_envs * self._columns.width)
+        actions = self._context.RawArray("d", num_envs * n_actions)
         self._rows, self._actions = shared(rows, num_envs), shared(actions, num_envs)
-        shares = np.array_split(np.arange(num_envs), min(processes, num_envs))
-        own, *others = (
-            Plan(self.arm, settings, self._columns, range(s[0], s[-1] + 1), rows, actions)
-            for s in shares
-        )
-        self._own = Crew(own, num_envs)
-        self._others = [CrewProcess(system, plan, num_envs) for plan in others]
+        shares = np.array_split(np.arange(num_envs), min(int(processes), num_envs))
+        # The recordings are read once, here.
+        settings |= {"demonstrations": self.demonstrations, "drums": self.drums}
+        settings.pop("mirror", None)
+        self._plans = [
+            Plan(settings, self._columns, range(s[0], s[-1] + 1), rows, actions) for s in shares
+        ]
+        self._own = Crew(self._plans[0], num_envs)
+        self._others: list[CrewProcess] = []
+        weakref.finalize(self, end, self._others)
         self._ready = False
 
     # What an arm has ----------------------------------------------------------------------
@@ -147,7 +153,7 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
     @property
     def processes(self) -> int:
         """How many processes move the arms, this one among them."""
-        return 1 + len(self._others)
+        return len(self._plans)
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -194,11 +200,30 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         return tuple(value for values in self._asked(method, *arguments) for value in values)
 
     def _asked(self, method: str, *arguments: Any) -> list[Any]:
-        """Return what a method of each crew returns; they are at it side by side."""
-        for crew in self._others:
-            crew.begin(method, *arguments)
-        own = getattr(self._own, method)(*arguments)
-        return [own, *(crew.result() for crew in self._others)]
+        """Return what a method of each crew returns; they are at it side by side.
+
+        Each crew gets its share of the arguments, of which all arms have one. After an error or an
+        interrupt nobody knows where the arms are: the processes are ended, and all arms must be
+        reset.
+        """
+        if self.closed:
+            raise gymnasium.error.ClosedEnvironmentError("The arms were closed: make them anew.")
+        own, *others = (
+            [argument[plan.share.start : plan.share.stop] for argument in arguments]
+            for plan in self._plans
+        )
+        try:
+            if not self._others:
+                for plan in self._plans[1:]:
+                    self._others.append(CrewProcess(self._context, plan, self.num_envs))
+            for crew, theirs in zip(self._others, others, strict=True):
+                crew.begin(method, *theirs)
+            mine = getattr(self._own, method)(*own)
+            return [mine, *(crew.result() for crew in self._others)]
+        except BaseException:
+            self._ready = False
+            end(self._others)
+            raise
 
     # Episodes -----------------------------------------------------------------------------
 
@@ -216,38 +241,45 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         return self._rows[:, self._columns.observation].copy(), self._info({}, begun)
 
     def _orders(self, seed: Any, options: dict[str, Any]) -> list[tuple[Any, Any] | None]:
-        """Return seed and options of each arm; None for one that goes on. They are checked here.
-
-        What a process raises would end it.
-        """
+        """Return seed and options of each arm, checked; None for one that goes on."""
         n = self.num_envs
         mask = self._checked_mask(options.pop("reset_mask", None))  # type: ignore[misc]
         if not (self._ready or mask.all()):
             raise gymnasium.error.ResetNeeded("Call reset() for all arms before some of them.")
-        seeds = [None] * n if seed is None else seed
-        if isinstance(seeds, int | np.integer):
-            seeds = [int(seeds) + i for i in range(n)]
-        if len(seeds) != n:
-            raise ValueError(f"Expected one seed, or one for each of {n} arms, got {seed}.")
         each: list[dict[str, Any]] = [{} for _ in range(n)]
         for key, value in options.items():
             own_shape = (3,) if key == "start" else ()
-            shared = value is None or np.shape(value) == own_shape
-            if not shared and np.shape(value) != (n, *own_shape):
+            for_all = value is None or np.shape(value) == own_shape
+            if not for_all and np.shape(value) != (n, *own_shape):
                 raise ValueError(
                     f"Expected options[{key!r}] of shape {own_shape} or {(n, *own_shape)}, got "
                     f"{np.shape(value)}."
                 )
             for i, own in enumerate(each):
-                own[key] = value if shared else value[i]
+                own[key] = value if for_all else value[i]
+        placed: set[tuple[float, ...]] = set()
         for i in np.flatnonzero(mask).tolist():
             _, start = checked_options(self.demonstrations, each[i])
-            if start is not None:
+            if start is not None and tuple(start) not in placed:
                 self._task.simulation.place(start)
+                placed.add(tuple(start))
         return [
             (own_seed, own) if due else None
-            for own_seed, own, due in zip(seeds, each, mask.tolist(), strict=True)
+            for own_seed, own, due in zip(self._seeds(seed), each, mask.tolist(), strict=True)
         ]
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        """Return each arm's seed."""
+        n = self.num_envs
+        seeds = [None] * n if seed is None else seed
+        if isinstance(seeds, int | np.integer):
+            seeds = [int(seeds) + i for i in range(n)]
+        if len(seeds) != n:
+            raise ValueError(f"Expected one seed, or one for each of {n} arms, got {seed}.")
+        for own in seeds:
+            if not (own is None or (isinstance(own, int | np.integer) and own >= 0)):
+                raise ValueError(f"Expected seeds that are whole numbers >= 0, got {own!r}.")
+        return [None if own is None else int(own) for own in seeds]
 
     def step(
         self, actions: FloatArray
@@ -290,8 +322,7 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the processes."""
-        for crew in self._others:
-            crew.close(**kwargs)
+        end(self._others, **{"terminate": False, **kwargs})
 
 
 class DrummingRecordedVectorEnv(DrummingVectorEnv):

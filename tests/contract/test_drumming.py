@@ -14,13 +14,19 @@ from gymnasium.utils.env_checker import check_env
 
 import iflow_gym  # noqa: F401  (registers the ids)
 from iflow_gym.baselines.references import ReplayPolicy
-from iflow_gym.datasets.drums import DRUMS, TIP_RADIUS, load_drums
+from iflow_gym.datasets.drums import DRUMS, RIGHT, TIP_RADIUS, load_drums
 from iflow_gym.demonstrations import Demonstrations
 from iflow_gym.envs.drumming import recorded
 from iflow_gym.envs.drumming.arguments import OBSERVABLES, ForcePush
 from iflow_gym.envs.drumming.control import BRAKING_TIME, JOINT_MARGIN, Workspace
 from iflow_gym.envs.drumming.env import DrummingEnv
-from iflow_gym.envs.drumming.scene import SPEED_LIMITS, TORQUE_LIMITS, assets_folder
+from iflow_gym.envs.drumming.scene import (
+    SPEED_LIMITS,
+    TORQUE_LIMITS,
+    assets_folder,
+    drawn_model,
+    load_scene,
+)
 from iflow_gym.envs.drumming.simulation import UnreachableError
 from iflow_gym.envs.task import Push
 from iflow_gym.evaluate import FIT_COSTS, evaluate
@@ -704,6 +710,27 @@ except DependencyNotInstalled as error:
     sys.exit(3)
 print(first.shape, first.dtype, first.std() > 20, (first != then).any())
 """
+
+
+def test_what_is_drawn_moves_as_what_is_simulated():
+    """Physics leave out the meshes that are only drawn: to the last bit the motion is the same."""
+    mujoco = pytest.importorskip("mujoco")
+    simulated, drawn = load_scene(DRUMS).model, drawn_model(DRUMS)
+    assert simulated.nbvh < 0.02 * drawn.nbvh
+    env = DrummingEnv()
+    env.reset(options={"start": np.add(RIGHT.head, [0.0, 0.0, 0.03])})
+    ends, touched = [], []
+    for model in (simulated, drawn):
+        data = mujoco.MjData(model)
+        data.qpos[:] = env.simulation.data.qpos
+        for k in range(400):
+            data.ctrl[:] = [0.0, 6.0, 0.0, 2.0, 0.0, 0.5 * np.sin(0.05 * k), 0.0]
+            mujoco.mj_step(model, data)
+            touched.append(data.ncon > 0)
+        ends.append([data.qpos, data.qvel, data.site_xpos[model.site("tip").id]])
+    assert sum(touched) > 20
+    for mine, other in zip(*ends, strict=True):
+        np.testing.assert_array_equal(mine, other)
 
 
 @pytest.mark.parametrize("backend", ["egl", "osmesa"])

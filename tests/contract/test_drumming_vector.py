@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import gc
+import multiprocessing
 import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from iflow_gym.datasets.drums import RIGHT
+from iflow_gym.datasets.drums import DRUMS, RIGHT, Drum
 from iflow_gym.envs.drumming.arguments import ForcePush
+from iflow_gym.envs.drumming.crew import Crew
 from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.vector import DrummingVectorEnv
 from iflow_gym.policy import DynamicalSystemPolicy
@@ -172,6 +179,8 @@ def test_other_errors(make):
         envs.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(ValueError, match="one for each of 2 arms"):
         envs.reset(seed=[1, 2, 3])
+    with pytest.raises(ValueError, match="whole numbers >= 0, got -1"):
+        envs.reset(seed=[1, -1])
     envs.reset(seed=0)
     with pytest.raises(ValueError, match=r"shape \(2, 3\), got \(3, 2\)"):
         envs.step(np.zeros((3, 2)))
@@ -192,41 +201,179 @@ def test_other_errors(make):
         torque.command_to_action(np.zeros(3), np.zeros(3))
 
 
-def test_a_process_that_is_killed_is_named(make):
-    envs = make(4, processes=2)
-    envs.reset(seed=0)
-    process = envs._others[0]._process
+def test_after_an_error_or_an_interrupt_all_arms_begin_anew(make, monkeypatch):
+    """Whatever had been done: the next reset gives what a new batch gives."""
+    ours, theirs = make(4, processes=3), one_by_one(4)
+    actions = np.full((4, 3), 0.1)
+    ours.reset(seed=0)
+    for raised in (KeyboardInterrupt, ZeroDivisionError):
+
+        def interrupted(raised=raised):
+            raise raised
+
+        with monkeypatch.context() as patch:
+            patch.setattr(ours._own, "step", interrupted)  # while the others are at it
+            with pytest.raises(raised):
+                ours.step(actions)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            ours.step(actions)
+        with pytest.raises(gymnasium.error.ResetNeeded, match="all arms before some"):
+            ours.reset(options={"reset_mask": np.array([True, False, True, True])})
+        assert_same(ours.reset(seed=7), theirs.reset(seed=7))
+        for _ in range(3):
+            assert_same(ours.step(actions), theirs.step(actions))
+
+
+def test_interrupts_at_any_time(make):
+    ours, theirs = make(4, processes=2), one_by_one(4)
+    actions = np.full((4, 3), 0.1)
+    ours.reset(seed=0)
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for delay in np.random.default_rng(0).uniform(1e-4, 3e-3, 40):
+            signal.setitimer(signal.ITIMER_REAL, delay)
+            try:
+                while True:
+                    ours.step(actions)
+            except KeyboardInterrupt:
+                pass
+            assert_same(ours.reset(seed=7), theirs.reset(seed=7))
+            assert_same(ours.step(actions), theirs.step(actions))
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_a_process_that_was_killed_is_named_and_the_next_reset_has_another(make):
+    ours, theirs = make(4, processes=2), one_by_one(4)
+    ours.reset(seed=0)
+    process = ours._others[0].process
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    with pytest.raises(RuntimeError, match=r"arms 2 to 3.*exit code -9.*anew"):
+    with pytest.raises(RuntimeError, match=r"arms 2 to 3.*exit code -9 \(it was killed.*anew"):
+        ours.step(np.zeros((4, 3)))
+    assert_same(ours.reset(seed=0), theirs.reset(seed=0))
+
+
+class OddError(Exception):
+    """An error that is not read back as it was written."""
+
+    def __init__(self, one, other):
+        super().__init__(one)
+
+
+def test_what_is_raised_in_a_process_is_raised_here(make, monkeypatch):
+    def strange(self):
+        if self._share.start:
+            raise OddError(1, 2) if self._share.start == 2 else ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr(Crew, "step", strange)
+    envs = make(2, processes=2)
+    envs.reset(seed=0)
+    with pytest.raises(ZeroDivisionError, match="by nothing") as caught:
+        envs.step(np.zeros((2, 3)))
+    assert "in the process of arm 1:" in str(caught.value.__cause__)
+    assert "in strange" in str(caught.value.__cause__)
+    envs = make(4, processes=2)
+    envs.reset(seed=0)
+    with pytest.raises(RuntimeError, match="OddError: 1"):
         envs.step(np.zeros((4, 3)))
 
 
-def test_what_is_raised_in_a_process_is_raised_here_and_it_goes_on(make):
-    envs = make(4, processes=2)
+def processes_of(envs):
+    return [crew.process for crew in envs._others]
+
+
+@pytest.mark.parametrize("way", ["close", "drop"])
+def test_processes_end_with_it(way):
+    kept = DrummingVectorEnv(2, processes=2)
+    kept.reset(seed=0)
+    envs = DrummingVectorEnv(4, processes=3)
     envs.reset(seed=0)
-    envs._others[0].begin("nothing")
-    with pytest.raises(AttributeError) as caught:
-        envs._others[0].result()
-    assert "in the process of arms 2 to 3" in str(caught.value.__cause__)
-    envs.step(np.zeros((4, 3)))
+    later = DrummingVectorEnv(2, processes=2)  # its processes know of the others' pipes
+    later.reset(seed=0)
+    processes = processes_of(envs)
+    assert len(processes) == 2
+    assert all(process.is_alive() for process in processes)
+    if way == "close":
+        envs.close()
+        envs.close()
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+            envs.step(np.zeros((4, 3)))
+    else:
+        del envs
+        gc.collect()
+    assert not any(process.is_alive() for process in processes)
+    for other in (kept, later):
+        other.step(np.zeros((2, 3)))
+        other.close()
 
 
-def test_an_answer_that_was_interrupted_is_not_taken_for_the_next(make):
-    ours, theirs = make(2, processes=2), one_by_one(2)
+def test_processes_end_when_that_of_the_batch_is_killed():
+    code = """
+import os, signal
+from iflow_gym.envs.drumming.vector import DrummingVectorEnv
+batches = [DrummingVectorEnv(3, processes=3) for _ in range(2)]
+for envs in batches:
+    envs.reset(seed=0)
+print(*(crew.process.pid for envs in batches for crew in envs._others), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL
+    left = set(map(int, done.stdout.split()))
+    assert len(left) == 4
+    until = time.monotonic() + 10
+    while left and time.monotonic() < until:
+        left = {pid for pid in left if is_running(pid)}
+        time.sleep(0.02)
+    assert not left
+
+
+def is_running(pid):
+    """Whether a process is there, and not only its entry in the table."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_in_a_daemon_all_arms_move_in_its_own_process():
+    context = multiprocessing.get_context("fork")
+    answers = context.SimpleQueue()
+    daemon = context.Process(target=batch_in_daemon, args=(answers,), daemon=True)
+    daemon.start()
+    daemon.join(60)
+    assert answers.get() == (1, (3, 3))
+
+
+def batch_in_daemon(answers):
+    envs = DrummingVectorEnv(3)
+    seen, _ = envs.reset(seed=0)
+    answers.put((envs.processes, seen.shape))
+
+
+def test_generators_are_copies(make):
+    ours, theirs = make(3, processes=2), one_by_one(3)
     ours.reset(seed=0)
     theirs.reset(seed=0)
-    ours._others[0].begin("seeds")  # and what asked was interrupted
-    assert_same(ours.step(np.zeros((2, 3))), theirs.step(np.zeros((2, 3))))
+    for generator in ours.np_random:
+        generator.random(5)
+    assert_same(ours.reset(), theirs.reset())
 
 
-def test_processes_end_with_it(make):
-    envs = make(4, processes=3)
-    envs.reset(seed=0)
-    processes = [crew._process for crew in envs._others]
-    assert all(process.is_alive() for process in processes)
-    envs.close()
-    assert not any(process.is_alive() for process in processes)
+def test_another_kit(make):
+    drums = (*DRUMS, Drum("far", (0.8, 0.0, 0.2), 0.08))
+    settings = {"drums": drums, "observe": ("tip", "force", "phase")}
+    ours, theirs = make(np.int64(2), processes=2, **settings), one_by_one(2, **settings)
+    assert_same(ours.reset(seed=0), theirs.reset(seed=0))
+    found = ours.step(np.zeros((2, 3), dtype=np.float32))
+    assert_same(found, theirs.step(np.zeros((2, 3), dtype=np.float32)))
+    assert found[-1]["forces"].shape == (2, 3)
 
 
 def test_spawned_processes_give_the_same(make):
