@@ -351,7 +351,8 @@ def results() -> str:
             kinds = {r.guarantee.kind for r in good if r.guarantee is not None}
             cells = f"{len(good)} of {len(of_method)}"
             shown = [f"{m:.3g}" for m in means]
-            shown[3] = f"{100 * means[3]:.3g} %"
+            all_but = means[3] < 1 and f"{100 * means[3]:.3g}" == "100"
+            shown[3] = "> 99.9 %" if all_but else f"{100 * means[3]:.3g} %"
             title = f"{good[0].title} (uses time)" if good[0].uses_time else good[0].title
             line = " | ".join([title, ", ".join(sorted(kinds)), *shown, cells])
             rows.append((means[1], f"| {line} |"))
