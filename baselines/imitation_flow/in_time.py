@@ -343,12 +343,19 @@ def rehearsed(model: ImitationFlow, env: Any, *, n_rounds: int = 3) -> FloatArra
 
     Raises
     ------
+    TypeError
+        If the environment is no arm with drums, or many of them.
     ValueError
         If a drum is not hit, or no round is to be heard.
     """
     if n_rounds < 1:
         raise ValueError(f"Expected n_rounds >= 1, got {n_rounds}.")
     task = env.unwrapped
+    if not (hasattr(task, "drums") and hasattr(task, "like")):
+        raise TypeError(
+            "Expected one arm at its drums, as gymnasium.make('iflow/Drumming-v0') makes it, got "
+            f"{type(task).__name__}."
+        )
     lead, heard = (round(n * task.demonstrations.period / task.dt) for n in (1, n_rounds))
     arm = task.like(horizon=lead + heard)
     policy = DynamicalSystemPolicy(model, arm)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import weakref
@@ -88,8 +89,11 @@ class Renderer:
         self._camera.fixedcamid = model.camera("front").id
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._pixels = np.empty((height, width, 3), dtype=np.uint8)
-        # Also at the interpreter's end, where OpenGL's own order of events would print errors.
+        # At the interpreter's end too, and then before MuJoCo's own end of EGL: it was registered
+        # when the context was opened, and what is registered later runs before.
         self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free.atexit = False
+        atexit.register(self._free)
 
     def frame(
         self, posture: FloatArray, trail: Sequence[FloatArray] = (), forces: Sequence[float] = ()
@@ -138,6 +142,7 @@ class Renderer:
     def close(self) -> None:
         """Free what OpenGL holds."""
         self._free()
+        atexit.unregister(self._free)
 
 
 def _free(gl: Any, context: Any) -> None:

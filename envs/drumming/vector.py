@@ -246,6 +246,7 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         mask = self._checked_mask(options.pop("reset_mask", None))  # type: ignore[misc]
         if not (self._ready or mask.all()):
             raise gymnasium.error.ResetNeeded("Call reset() for all arms before some of them.")
+        checked_options(self.demonstrations, dict.fromkeys(options))  # that they are options
         each: list[dict[str, Any]] = [{} for _ in range(n)]
         for key, value in options.items():
             own_shape = (3,) if key == "start" else ()
@@ -274,8 +275,8 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         seeds = [None] * n if seed is None else seed
         if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + i for i in range(n)]
-        if len(seeds) != n:
-            raise ValueError(f"Expected one seed, or one for each of {n} arms, got {seed}.")
+        if np.shape(seeds) != (n,):
+            raise ValueError(f"Expected one seed, or one for each of {n} arms, got {seed!r}.")
         for own in seeds:
             if not (own is None or (isinstance(own, int | np.integer) and own >= 0)):
                 raise ValueError(f"Expected seeds that are whole numbers >= 0, got {own!r}.")
@@ -319,6 +320,13 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         for i in range(self.num_envs):
             infos["hits"][i] = hits.get(i, ()) if told[i] else None
         return {k: v for key in infos for k, v in ((key, infos[key]), (f"_{key}", told.copy()))}
+
+    def render(self) -> None:
+        """Refuse: a batch has no picture."""
+        raise NotImplementedError(
+            "A batch of arms does not render: use gymnasium.make(id, render_mode='rgb_array'), or "
+            "gymnasium.make_vec(id, n, vectorization_mode='sync', render_mode='rgb_array')."
+        )
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the processes."""

@@ -742,6 +742,19 @@ def test_pictures(backend):
     assert done.stderr == ""
 
 
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_an_arm_that_was_never_closed_leaves_without_a_word(backend):
+    """Also where something else asked to be called at the end before OpenGL was there."""
+    before = "import weakref\nclass Thing: pass\nthing = Thing()\nweakref.finalize(thing, print)\n"
+    after = "\nkept = env  # until the end"
+    done = run_python(before + PICTURE + after, MUJOCO_GL=backend,
+                      PYOPENGL_PLATFORM=backend)  # fmt: skip
+    if done.returncode == 3:
+        pytest.skip(f"no OpenGL by {backend}: {done.stdout.strip()}")
+    assert done.returncode == 0
+    assert done.stderr == ""
+
+
 def test_without_opengl_the_error_says_what_to_install():
     done = run_python(PICTURE, MUJOCO_GL="disable")
     assert done.returncode == 3, done.stderr

@@ -161,6 +161,7 @@ def test_what_make_vec_makes_is_what_a_policy_drives():
         ({"reset_mask": [True] * N}, TypeError, "boolean array"),
         ({"reset_mask": np.zeros(N, dtype=bool)}, ValueError, "true at least once"),
         ({"nothing": 1}, ValueError, "Expected reset options among"),
+        ({"strat": [0.68, 0.0, 0.42]}, ValueError, r"Expected reset options among.*\['strat'\]"),
     ],
 )
 def test_a_bad_option_is_refused_and_the_arms_go_on(make, options, error, match):
@@ -179,6 +180,10 @@ def test_other_errors(make):
         envs.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(ValueError, match="one for each of 2 arms"):
         envs.reset(seed=[1, 2, 3])
+    with pytest.raises(ValueError, match=r"one for each of 2 arms, got 1\.5"):
+        envs.reset(seed=1.5)
+    with pytest.raises(NotImplementedError, match="does not render: use"):
+        envs.render()
     with pytest.raises(ValueError, match="whole numbers >= 0, got -1"):
         envs.reset(seed=[1, -1])
     envs.reset(seed=0)
