@@ -264,5 +264,5 @@ class TestTheArm:
             rehearsed(model, env, n_rounds=1)
         with pytest.raises(ValueError, match="n_rounds >= 1, got 0"):
             rehearsed(model, env, n_rounds=0)
-        with pytest.raises(TypeError, match="one arm at its drums.*got LASAEnv"):
+        with pytest.raises(TypeError, match=r"one arm at its drums.*got LASAEnv"):
             rehearsed(model, gymnasium.make("iflow/LASA-Line-v0"))
