@@ -9,8 +9,8 @@ fast as one as there are cores.
 
 - *by make_vec*: the suite's own batch, whose processes, one a core, share the arms out.
 - *AsyncVectorEnv*: Gymnasium's, with a process for each arm.
-- *of an idle one*: the same of an environment whose step only computes for as long as the arm's
-  does, in the least memory, and which tells nothing: what no arm can be faster than there.
+- *of an idle one*: the same of an environment whose step only counts for about as long as the arm's
+  takes, in the least memory, and which tells nothing: what processes and messages alone cost.
 """
 
 from __future__ import annotations

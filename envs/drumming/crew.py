@@ -87,8 +87,10 @@ class Plan(NamedTuple):
     settings: dict[str, Any]
     """Arguments of `DrummingEnv`."""
     columns: Columns
+    n: int
+    """How many arms there are in all."""
     share: range
-    """Which of all arms they are."""
+    """Which of them they are."""
     rows: Any
     """Of all arms; an array of `multiprocessing`, which holds no NumPy array when it travels."""
     actions: Any
@@ -104,11 +106,12 @@ def shared(memory: Any, n: int) -> FloatArray:
 class Crew:
     """Some of the arms; methods return a value for each."""
 
-    def __init__(self, plan: Plan, n: int) -> None:
+    def __init__(self, plan: Plan) -> None:
         self._arms = [DrummingEnv(**plan.settings) for _ in plan.share]
         self._share, self._columns = plan.share, plan.columns
         own = slice(plan.share.start, plan.share.stop)
-        self._rows, self._actions = shared(plan.rows, n)[own], shared(plan.actions, n)[own]
+        self._rows = shared(plan.rows, plan.n)[own]
+        self._actions = shared(plan.actions, plan.n)[own]
         self._ended = [False] * len(self._arms)
 
     def reset(self, orders: Sequence[Order | None]) -> None:
@@ -156,13 +159,13 @@ class CrewProcess:
     further use: `end` it.
     """
 
-    def __init__(self, context: Any, plan: Plan, n: int) -> None:
+    def __init__(self, context: Any, plan: Plan) -> None:
         self._pipe, theirs = context.Pipe()
         self._owner = os.getpid()
         first, last = plan.share.start, plan.share.stop - 1
         self.name = f"arm {first}" if first == last else f"arms {first} to {last}"
         self.process = context.Process(
-            target=_serve, args=(theirs, self._pipe, plan, n), name=self.name, daemon=True
+            target=_serve, args=(theirs, self._pipe, plan), name=self.name, daemon=True
         )
         self.process.start()
         theirs.close()
@@ -247,7 +250,7 @@ def _received(pipe: Connection) -> Any:
     return pipe.recv()
 
 
-def _serve(pipe: Connection, other_end: Connection, plan: Plan, n: int) -> None:
+def _serve(pipe: Connection, other_end: Connection, plan: Plan) -> None:
     """Do what comes through a pipe until None does, or until its other end is closed."""
     other_end.close()  # a fork has it too, and would never see it closed
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for who asked
@@ -263,7 +266,7 @@ def _serve(pipe: Connection, other_end: Connection, plan: Plan, n: int) -> None:
         method, arguments = asked
         answer: tuple[Any, Exception | None, str]
         try:
-            crew = crew or Crew(plan, n)
+            crew = crew or Crew(plan)
             answer = getattr(crew, method)(*arguments), None, ""
         except Exception as error:
             answer = None, _travelling(error), traceback.format_exc()
@@ -277,6 +280,6 @@ def _travelling(error: Exception) -> Exception:
     """Return an error if it comes through a pipe whole, else one that says what it was."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:
+    except Exception:  # what an error's own code raises when it is written or read
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import weakref
 from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
 import gymnasium
+import joblib
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -24,13 +24,6 @@ from iflow_gym.envs.point_mass_vector import PointMassVectorEnv
 from iflow_gym.metrics.drumming import Hit
 
 BoolArray = NDArray[np.bool_]
-
-
-def available_cores() -> int:
-    """Return how many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
@@ -57,7 +50,8 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
     num_envs : int
         How many arms, n.
     processes : int, optional
-        At most so many, this one among them; None takes the processors that this process may use.
+        At most so many, this one among them; None takes the processors that this process may use
+        (`joblib.cpu_count`).
     context : str, optional
         How processes begin, of `multiprocessing.get_context`. Where they are spawned, as they are
         by default on macOS, a script makes the batch under ``if __name__ == "__main__":``.
@@ -101,7 +95,7 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         self._columns = Columns(len(first), info)
         (n_actions,) = cast("tuple[int]", self.single_action_space.shape)
         if processes is None:  # a daemon, such as a worker of another batch, can have none
-            processes = 1 if multiprocessing.current_process().daemon else available_cores()
+            processes = 1 if multiprocessing.current_process().daemon else joblib.cpu_count()
         self._context: Any = multiprocessing.get_context(context)
         rows = self._context.RawArray("d", num_envs * self._columns.width)
         actions = self._context.RawArray("d", num_envs * n_actions)
@@ -111,9 +105,10 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         settings |= {"demonstrations": self.demonstrations, "drums": self.drums}
         settings.pop("mirror", None)
         self._plans = [
-            Plan(settings, self._columns, range(s[0], s[-1] + 1), rows, actions) for s in shares
+            Plan(settings, self._columns, num_envs, range(s[0], s[-1] + 1), rows, actions)
+            for s in shares
         ]
-        self._own = Crew(self._plans[0], num_envs)
+        self._own = Crew(self._plans[0])
         self._others: list[CrewProcess] = []
         weakref.finalize(self, end, self._others)
         self._ready = False
@@ -215,7 +210,7 @@ class DrummingVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
         try:
             if not self._others:
                 for plan in self._plans[1:]:
-                    self._others.append(CrewProcess(self._context, plan, self.num_envs))
+                    self._others.append(CrewProcess(self._context, plan))
             for crew, theirs in zip(self._others, others, strict=True):
                 crew.begin(method, *theirs)
             mine = getattr(self._own, method)(*own)

@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from iflow_gym.datasets.drums import DRUMS, RIGHT, Drum
 from iflow_gym.envs.drumming.arguments import ForcePush
-from iflow_gym.envs.drumming.crew import Crew
+from iflow_gym.envs.drumming.crew import Crew, end
 from iflow_gym.envs.drumming.env import DrummingEnv
 from iflow_gym.envs.drumming.vector import DrummingVectorEnv
 from iflow_gym.policy import DynamicalSystemPolicy
@@ -316,6 +316,22 @@ def test_processes_end_with_it(way):
     for other in (kept, later):
         other.step(np.zeros((2, 3)))
         other.close()
+
+
+def test_a_fork_does_not_end_what_it_has_not_begun(make):
+    ours, theirs = make(2, processes=2), one_by_one(2)
+    ours.reset(seed=0)
+    theirs.reset(seed=0)
+    fork = os.fork()
+    if not fork:
+        failed = 1
+        try:
+            end(ours._others)
+            failed = 0
+        finally:
+            os._exit(failed)
+    assert os.waitpid(fork, 0)[1] == 0
+    assert_same(ours.step(np.zeros((2, 3))), theirs.step(np.zeros((2, 3))))
 
 
 def test_processes_end_when_that_of_the_batch_is_killed():
