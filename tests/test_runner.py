@@ -362,6 +362,8 @@ def test_an_interrupted_run_keeps_what_is_done_and_the_next_one_goes_on(toys, tm
     (toys / "sleep-Toy-C").touch()
     command = ["--preset", "smoke", "--jobs", "1", "--methods", "toys:Toy", "--envs", *MOTIONS]
     command += ["--output", output]
+    # A job in a shell's background ignores interrupts, and so would what it starts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
         [sys.executable, ROOT / "baselines" / "run_all.py", *command],
         cwd=toys,
@@ -369,6 +371,7 @@ def test_an_interrupted_run_keeps_what_is_done_and_the_next_one_goes_on(toys, tm
         stderr=subprocess.PIPE,
         text=True,
     )
+    signal.signal(signal.SIGINT, before)
     deadline = time.monotonic() + 60
     while len(list(output.glob("*/*.json"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.1)
